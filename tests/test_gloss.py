@@ -15,7 +15,7 @@ from warpshadow.inverse.uncertainty import NormalMatrix
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bounces import static_bounces
 from warpshadow.pipeline.methods.directional import Directional
-from warpshadow.pipeline.shading.method import Method
+from warpshadow.pipeline.shading.lobe_light import LobeVisibility
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 # Interpolation between texels is linear piece by piece, and steps of differences go over some. Measured 0.1 to 1.2%.
@@ -158,8 +158,8 @@ SUNNY = dataclasses.replace(
 
 def test_the_highlight_of_a_sun_is_that_of_many_samples_of_lobes(monkeypatch):
     image = ws.Renderer(SUNNY).render()[..., :3]
-    monkeypatch.setattr(Method, "suns", lambda self, light: None)
-    monkeypatch.setattr(Method, "lobe_samples", 4 * 2048)
+    monkeypatch.setattr(LobeVisibility, "_separated", lambda *_: None)
+    monkeypatch.setattr(LobeVisibility, "sample_count", 4 * 2048)
     many = ws.Renderer(SUNNY).render()[..., :3]
     # measured 2.1%; 16% where samples look for the sun, as many as there are
     assert np.linalg.norm(image - many) < 0.03 * np.linalg.norm(many)

@@ -92,11 +92,11 @@ def _volume(points: np.ndarray, triangles: np.ndarray) -> float:
     return float(np.linalg.det(points[triangles] - points[triangles[0, 0]]).sum() / 6)
 
 
-def _bulge(points: np.ndarray, section: np.ndarray, next_section: np.ndarray, between: np.ndarray) -> float:
+def _bulge(points: np.ndarray, section: np.ndarray, next_section: np.ndarray, middle_sections: np.ndarray) -> float:
     """Largest distance of sections from the straight lines between two others."""
     starts, lines = points[section], points[next_section] - points[section]
     units = lines / np.linalg.norm(lines, axis=1, keepdims=True)
-    return float(np.linalg.norm(np.cross(points[between] - starts, units), axis=-1).max(initial=0.0))
+    return float(np.linalg.norm(np.cross(points[middle_sections] - starts, units), axis=-1).max(initial=0.0))
 
 
 def _swell(radii: np.ndarray, chosen: np.ndarray) -> float:

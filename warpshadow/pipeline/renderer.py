@@ -31,7 +31,7 @@ from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.receivers.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.pipeline.receivers.unevenness import NearLight
-from warpshadow.pipeline.shading.transfers import Light, join_transfers
+from warpshadow.pipeline.shading.transfers import Light, join_rows
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.catchers import CatchersAlone
 from warpshadow.pipeline.views.layers import LayerArrays, Layers, find_layer_arrays, find_layers
@@ -192,7 +192,7 @@ class SceneRenderer:
                 :func:`warpshadow.stages.raster.project.compose_clip_matrices`.
         Differentiable: geometry, clip_matrices.
         """
-        return self._views.find(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
+        return self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
 
     at_points = delegated("_views", SceneViews.at_points)
     on_faces = delegated("_views", SceneViews.on_faces)
@@ -237,7 +237,7 @@ class SceneRenderer:
                 "shade and draw take free light that bounces, with any method"
             )
         view = self._scene_view
-        return join_transfers(view.transfers.value(self._views.call(view)))
+        return join_rows(view.transfers.value(self._views.call(view)))
 
     @announced
     def shade(self, light: Light | None = None, view: LitPoints | None = None) -> wp.array:
@@ -313,9 +313,8 @@ class SceneRenderer:
             Linear RGB, premultiplied, and coverage, vec4 of shape [batch, height, width]; the background is 0.
         Differentiable: all; not by "ray-traced": geometry, clip_matrices, shell.
         """
-        if inputs.view is None and inputs.geometry is None and inputs.clip_matrices is None:
-            return self.draw_inputs(inputs, self._scene_view)
-        return self.draw_inputs(inputs, inputs.view)
+        is_of_scene = inputs.view is None and inputs.geometry is None and inputs.clip_matrices is None
+        return self.draw_inputs(inputs, self._scene_view if is_of_scene else inputs.view)  # the former warns
 
     @announced
     def draw_inputs(self, inputs: ImageArrays, view: View | None = None) -> wp.array:
@@ -456,8 +455,7 @@ class SceneRenderer:
             inputs: All that an image takes.
         Returns:
             The stages, which print as a table: whether each runs and on how many items, how long it took last, and why
-            it does or does not run; then the same of the adjoints. Nothing of the call is computed, but where
-            bodies shine the suns of a map that it gives.
+            it does or does not run; then the same of the adjoints. Nothing of the call is computed.
         """
         return self.explain_inputs(inputs, inputs.view)
 
@@ -470,7 +468,7 @@ class SceneRenderer:
             hidden = {*decide_which_nodes_run(view.receivers_node, view.call), view.silhouettes}
         else:
             geometry = None if inputs.geometry is None else as_geometry("geometry", inputs.geometry)
-            view = self._views.view(geometry, inputs.clip_matrices)
+            view = self._views.lazy_view(geometry, inputs.clip_matrices)
         preview = view.preview()  # which the nodes' words ask, so it stays meanwhile
         light = self._method.light_input(preview, inputs.light, inputs.shell)
         materials = self.materials(inputs.of_bodies)

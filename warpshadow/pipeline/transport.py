@@ -28,13 +28,15 @@ from typing import TYPE_CHECKING
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints
-from warpshadow.pipeline.shading.method import LightInput, Method
+from warpshadow.pipeline.shading.light_input import LightInput
+from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.light.sums import add_light
 
-if TYPE_CHECKING:  # they are imported where light bounces
+if TYPE_CHECKING:  # they are imported where light bounces, or bodies shine
     from warpshadow.pipeline.bounces.moving_bounces import MovingBounces
     from warpshadow.pipeline.bounces.patches import ScenePatches
     from warpshadow.pipeline.bounces.static_bounces import StaticBounces
+    from warpshadow.pipeline.shading.lobe_light import LitLobes
 
 
 class Bouncing(enum.Enum):
@@ -139,14 +141,22 @@ class LightTransport:
         samples = self._static_bounces.patch_samples(points, materials)
         return self._with_emitters(self.method.direct_shading(samples, light), samples, materials)
 
-    def openness(self, points: LitPoints, light: LightInput, materials: Materials) -> Node | None:
+    def blocked_radiance(self, lobes: LitLobes, materials: Materials) -> Node | None:
+        """Mean radiance of the blockers of receivers on bodies that shine; None where light does not bounce."""
+        if not self.method.merged_scene.scene.bounces:
+            return None
+        arguments = lobes.all_points, lobes.light, materials
+        bounced, openness = self.shading_without_emitters(*arguments), self._openness(*arguments)
+        own_openness = None if openness is None else lobes.select(openness)
+        return self.method.lobes.blocked_radiance(lobes, lobes.select(bounced), own_openness)
+
+    def _openness(self, points: LitPoints, light: LightInput, materials: Materials) -> Node | None:
         """Part of the hemispheres of points that no blocker takes, vec3 of shape [view, receiver].
 
         It is found by the rays along which light bounces between static patches; None where light bounces in another
-        way, or not at all.
+        way.
         """
-        has_bounces = bool(self.method.merged_scene.scene.bounces)
-        if not has_bounces or self.bouncing(points, light, materials) is not Bouncing.STATIC:
+        if self.bouncing(points, light, materials) is not Bouncing.STATIC:
             return None
         lit = None if light.is_free else self._lit_patch_samples(points, light, materials)
         return self._static_bounces.openness(points, materials, lit)

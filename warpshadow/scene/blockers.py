@@ -169,8 +169,8 @@ def fitted_meshes(scene: Scene) -> dict[int, FitRequest]:
     for number, count in _fitted_counts(scene, parts).items():
         land = None if number in parts else _solid_behind(scene, number)
         steps = STEPS_BESIDE_PARTS if number in parts else STEPS
-        mesh, side = (scene.bodies[number].mesh, None) if land is None else (land.solid, land.seen_from)
-        result[number] = FitRequest(mesh, count, steps, side)
+        mesh, seen_from = (scene.bodies[number].mesh, None) if land is None else (land.solid, land.seen_from)
+        result[number] = FitRequest(mesh, count, steps, seen_from)
     return result
 
 
@@ -256,11 +256,11 @@ def _ground_sphere(mesh: Mesh, others: list[np.ndarray]) -> Spheres | None:
         normal = -normal
     elif min(heights) <= 0:
         return None
-    seen_from = np.concatenate(others)
-    height = np.mean((seen_from - middle) @ normal)
-    solid_angle = np.abs(solid_angles(corners - seen_from.mean(axis=0))).sum()
+    other_points = np.concatenate(others)
+    height = np.mean((other_points - middle) @ normal)
+    solid_angle = np.abs(solid_angles(corners - other_points.mean(axis=0))).sum()
     cosine = 1 - solid_angle / (2 * np.pi)
     sine = min(np.sqrt(1 - cosine**2), 0.999)  # beyond, float32 would not place a sphere so large on the plane
     radius = height * sine / (1 - sine)
-    foot = seen_from.mean(axis=0) - height * normal
+    foot = other_points.mean(axis=0) - height * normal
     return Spheres((foot - radius * normal)[None].astype(np.float32), np.array([radius], np.float32))

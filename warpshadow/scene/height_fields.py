@@ -88,14 +88,14 @@ def _share_behind_panels(mesh: Mesh, axis: np.ndarray, points: np.ndarray) -> fl
     is_behind = np.zeros(len(points), bool)
     for panel in mesh.convex_parts:
         corners = mesh.positions[panel.corners].astype(np.float64)
-        middle, sides = corners.mean(axis=0), np.roll(corners, -1, axis=0) - corners
+        middle, edge_vectors = corners.mean(axis=0), np.roll(corners, -1, axis=0) - corners
         spokes = corners - middle
         normal = np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0)
         normal /= np.linalg.norm(normal)
-        outlines = ((points[:, None] - corners) * np.cross(normal, sides)).sum(axis=-1)
+        edge_distances = ((points[:, None] - corners) * np.cross(normal, edge_vectors)).sum(axis=-1)
         depths = -np.sign(normal @ axis) * ((points - middle) @ normal)
         radius = np.linalg.norm(spokes, axis=1).max()
-        is_behind |= (outlines >= 0).all(axis=1) & (depths > 0) & (depths < radius)
+        is_behind |= (edge_distances >= 0).all(axis=1) & (depths > 0) & (depths < radius)
     return float(is_behind.mean())
 
 

@@ -247,8 +247,8 @@ def _ground_mesh(size: float) -> Mesh:
     return plane(size, 1)
 
 
-def _draw_between(rng: np.random.Generator, between: Range) -> float:
-    low, high = between
+def _draw_between(rng: np.random.Generator, limits: Range) -> float:
+    low, high = limits
     return low if low == high else float(rng.uniform(low, high))
 
 
@@ -266,8 +266,8 @@ def _random_bodies(
     ring = 0.0 if count == 1 else _draw_between(rng, ranges.gap) * widest / np.sin(np.pi / count)
     angles = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / count
     places = ring * np.stack([np.cos(angles), np.zeros(count), np.sin(angles)], axis=1)
-    placed = zip(bodies, places, strict=True)
-    return [replace(body, translation=body.translation + place) for body, place in placed], chosen
+    pairs = zip(bodies, places, strict=True)
+    return [replace(body, translation=body.translation + place) for body, place in pairs], chosen
 
 
 def _random_body(rng: np.random.Generator, prototypes: Sequence[Body], ranges: Ranges) -> tuple[Body, int]:
@@ -321,9 +321,9 @@ def _turned_map(
     return maps[drawn.number].rotated(drawn.rotation).scaled(drawn.scale), drawn
 
 
-def _random_scale(rng: np.random.Generator, between: Range) -> float:
+def _random_scale(rng: np.random.Generator, limits: Range) -> float:
     """A factor, as often half as large as twice."""
-    low, high = between
+    low, high = limits
     return float(2 ** _draw_between(rng, (np.log2(low), np.log2(high))))
 
 

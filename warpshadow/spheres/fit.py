@@ -116,11 +116,11 @@ def fit_spheres(
     if error is not None:
         check.positive("error", error)
     fit_device = check.device("device", device)
-    side = None if seen_from is None else _unit_vector(seen_from)
-    key = count, error, seed, steps if refine else 0, side, fit_device.alias, cache_folder()
+    seen_from = _unit_vector(seen_from)
+    key = count, error, seed, steps if refine else 0, seen_from, fit_device.alias, cache_folder()
     if cache and key in _FITS.get(mesh, ()):
         return _FITS[mesh][key]
-    fit_key, center, diagonal = _find_fit_key(mesh, seed, steps if refine else 0, fit_device, side)
+    fit_key, center, diagonal = _find_fit_key(mesh, seed, steps if refine else 0, fit_device, seen_from)
     fit_count = partial(_cached_fit if cache else _fit, fit_key, progress)
     with unrecorded():
         balls, report = fit_count(count) if error is None else _search(fit_count, error)
@@ -159,9 +159,11 @@ def _warn_of_holes(mesh: Mesh, count: int | str, report: FitReport) -> None:
     )
 
 
-def _unit_vector(direction: Sequence[float]) -> tuple[float, float, float]:
-    """A direction, checked, of length 1 to six digits."""
-    vector = check.array("seen_from", direction, (3,), "a direction (x, y, z)").astype(np.float64)
+def _unit_vector(seen_from: Sequence[float] | None) -> tuple[float, float, float] | None:
+    """The direction, checked, of length 1 to six digits."""
+    if seen_from is None:
+        return None
+    vector = check.array("seen_from", seen_from, (3,), "a direction (x, y, z)").astype(np.float64)
     if not np.any(vector):
         raise ValueError("seen_from: got a zero vector, expected a direction")
     x, y, z = np.round(vector / np.linalg.norm(vector), 6).tolist()
@@ -176,9 +178,8 @@ def is_fitted(
     *,
     device: wp.DeviceLike = "cpu",
 ) -> bool:
-    """Whether the cache has the fit of :func:`fit_spheres` for a mesh, a count, a number of steps and a side."""
-    side = None if seen_from is None else _unit_vector(seen_from)
-    fit_key, *_ = _find_fit_key(mesh, 0, steps, wp.get_device(device), side)
+    """Whether the cache has the fit of :func:`fit_spheres` for a mesh, a count, a number of steps and a direction."""
+    fit_key, *_ = _find_fit_key(mesh, 0, steps, wp.get_device(device), _unit_vector(seen_from))
     return _cache_path(fit_key, count).exists()
 
 
@@ -188,7 +189,7 @@ def fit_seconds(count: int | str) -> float:
 
 
 def _find_fit_key(
-    mesh: Mesh, seed: int, steps: int, device: wp.Device, side: tuple[float, float, float] | None
+    mesh: Mesh, seed: int, steps: int, device: wp.Device, seen_from: tuple[float, float, float] | None
 ) -> tuple[_SphereFitKey, np.ndarray, float]:
     """Key of a fit; the middle of the mesh's bounds and their diagonal."""
     positions, faces = welded(mesh.positions, mesh.faces)  # parted at creases or not, a mesh has the same spheres
@@ -197,7 +198,7 @@ def _find_fit_key(
     if not area_normals(corners).any():
         raise ValueError("mesh: got only faces without area, expected a surface")
     normalized, center, diagonal = normalize(positions)
-    return _SphereFitKey(normalized, faces, seed, steps, device, side), center, diagonal
+    return _SphereFitKey(normalized, faces, seed, steps, device, seen_from), center, diagonal
 
 
 def _search(
@@ -232,14 +233,14 @@ class _SphereFitKey:
     seed: int
     steps: int
     device: wp.Device
-    side: tuple[float, float, float] | None  # from which alone the mesh is seen
+    seen_from: tuple[float, float, float] | None  # from which alone the mesh is seen
 
     def key(self, count: int | str) -> str:
         """Hash of all of it."""
         kind = "cpu" if self.device.is_cpu else "cuda"
         key_numbers = [ALGORITHM_VERSION, count, self.seed, self.steps, kind, self.positions.shape]
-        if self.side is not None:
-            key_numbers.append(self.side)
+        if self.seen_from is not None:
+            key_numbers.append(self.seen_from)
         key = hashlib.sha256(json.dumps(key_numbers).encode())
         key.update(self.positions.tobytes())
         key.update(self.faces.tobytes())
@@ -254,8 +255,8 @@ def _fit(
 
     cached_arrays = {} if unfinished is None else unfinished.before
     began = time.perf_counter() - float(cached_arrays.get("seconds", 0.0))
-    side = None if fit_key.side is None else np.array(fit_key.side)
-    mesh = NormalizedMesh(fit_key.positions, fit_key.faces, fit_key.device, side)
+    seen_from = None if fit_key.seen_from is None else np.array(fit_key.seen_from)
+    mesh = NormalizedMesh(fit_key.positions, fit_key.faces, fit_key.device, seen_from)
     spheres = cached_arrays.get("spheres", np.zeros((0, 4)))
     total, done_steps = (fit_key.steps or COVER_STEPS) if count else 0, int(cached_arrays.get("step_count", 0))
     label = f"fitting {'as many spheres as it takes' if count == AUTO else f'{count} spheres'}"

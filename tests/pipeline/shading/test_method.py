@@ -9,6 +9,7 @@ from warpshadow.pipeline.methods.directional import Directional
 from warpshadow.pipeline.methods.log_sh import LogSH
 from warpshadow.pipeline.methods.none import NoShadows
 from warpshadow.pipeline.methods.ray_traced import RayTraced
+from warpshadow.pipeline.shading.lobe_light import LobeVisibility
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.shading.sphere_method import SphereMethod
 
@@ -23,14 +24,23 @@ def refuses(function):
     return "raise NotImplementedError" in inspect.getsource(function)
 
 
-@pytest.mark.parametrize("kind", [Method, SphereMethod])
-def test_the_table_of_members_says_which_have_a_default(kind):
+@pytest.mark.parametrize(("kind", "row_count"), [(Method, 9), (SphereMethod, 13), (LobeVisibility, 3)])
+def test_the_table_of_members_says_which_have_a_default(kind, row_count):
     rows = table(kind)
     defaults = {name: default for names, default in rows for name in names}
-    own = {name for name in kind.__abstractmethods__ if name in vars(kind)} | {"free_basis"} & set(defaults)
-    assert len(rows) > 9 and {name for name, default in defaults.items() if default == "–"} == own
+    abstract = getattr(kind, "__abstractmethods__", ())
+    own = {name for name in abstract if name in vars(kind)} | {"free_basis"} & set(defaults)
+    assert len(rows) == row_count and {name for name, default in defaults.items() if default == "–"} == own
     refused = {name for name, function in vars(kind).items() if inspect.isfunction(function) and refuses(function)}
     assert {name for name, default in defaults.items() if default == "refused"} == refused
+
+
+@pytest.mark.parametrize("kind", [Directional, LogSH, NoShadows, RayTraced])
+def test_each_member_that_a_method_overrides_is_in_a_table(kind):
+    listed = {name for base in (Method, SphereMethod) for names, _ in table(base) for name in names}
+    members = {name for name, member in (vars(Method) | vars(SphereMethod)).items() if not isinstance(member, bool)}
+    overridden = {name for name in vars(kind) if name in members and not name.startswith("_")} - {"why_no_shadows"}
+    assert overridden and overridden <= listed
 
 
 @pytest.mark.parametrize("kind", [Directional, LogSH, NoShadows, RayTraced])

@@ -149,8 +149,8 @@ def test_what_receivers_see_of_fronts_can_be_given(device, verified_tape):
     fronts = wp.array(setting.fronts[None], dtype=wp.float32, device=device, requires_grad=True)
     with recorded() as tape:
         frames, planes = setting.planes.frames(vertices), setting.planes
-        light = plane_light(points, normals, transmittance, frames, radiosity, planes, DIRECTIONS, fronts=fronts)
-        passing = passing_flats(points, transmittance, frames, planes, DIRECTIONS, fronts=fronts)
+        light = plane_light(points, normals, transmittance, frames, radiosity, planes, DIRECTIONS, front_weights=fronts)
+        passing = passing_flats(points, transmittance, frames, planes, DIRECTIONS, front_weights=fronts)
     np.testing.assert_allclose(light.numpy()[0], setting.light(), atol=FLOAT32)
     np.testing.assert_allclose(passing.numpy()[0], setting.passing(), atol=FLOAT32)
 

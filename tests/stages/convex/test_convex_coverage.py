@@ -75,7 +75,7 @@ POINTS = np.array(
 
 
 def of_kernel(points, device, directions=DIRECTIONS, **options):
-    placed = blockers(device).placed(wp.array(np.concatenate(VERTICES)[None], dtype=wp.vec3, device=device))
+    placed = blockers(device).place(wp.array(np.concatenate(VERTICES)[None], dtype=wp.vec3, device=device))
     arguments = wp.array(points[None], dtype=wp.vec3, device=device), placed, blockers(device), directions
     return part_coverage(*arguments, **options).numpy()[0]
 
@@ -93,7 +93,7 @@ def test_a_panel_is_two_sided_and_blocks_nothing_of_receivers_in_its_plane(devic
     corners = np.array([[-0.5, 0.2, -0.4], [0.6, 0.2, -0.5], [0.5, 0.2, 0.6], [-0.4, 0.2, 0.3]])
     (panel,) = find_convex_parts(corners, np.array([[0, 1, 2], [0, 2, 3]]))
     some = ConvexBlockers.from_bodies([ConvexBody([panel], 0)], 4, device=device)
-    placed = some.placed(wp.array(corners[None], dtype=wp.vec3, device=device))
+    placed = some.place(wp.array(corners[None], dtype=wp.vec3, device=device))
     points = np.array([[0.1, 1.0, 0.0], [0.1, -0.1, 0.1], [0.1, 0.2, 0.1], [3.0, 0.2, 0.1]])
     arguments = wp.array(points[None], dtype=wp.vec3, device=device), placed, some, DIRECTIONS
     got = part_coverage(*arguments).numpy()[0]
@@ -111,7 +111,7 @@ def test_a_shell_covers_where_it_is_met_once_or_twice(device):
     parts = find_convex_parts(mug.vertices, mug.faces)
     outer = mug.vertices[np.unique(np.concatenate([part.corners for part in parts]))]
     some = ConvexBlockers.from_bodies([ConvexBody(parts, 0)], len(mug.vertices), device=device)
-    placed = some.placed(wp.array(mug.vertices[None], dtype=wp.vec3, device=device))
+    placed = some.place(wp.array(mug.vertices[None], dtype=wp.vec3, device=device))
     below = np.array([[2.0, 0.3, -0.5], [-1.5, 0.4, -0.1], [0.2, 0.1, -1.0]])
     points = np.concatenate([below, [[0.3, 0.2, 0.7]]])
     got = part_coverage(wp.array(points[None], dtype=wp.vec3, device=device), placed, some, DIRECTIONS).numpy()[0]
@@ -130,7 +130,7 @@ def test_a_cell_whose_middle_is_on_an_edge_is_half_covered(turn, device):
     corners = np.roll(np.array([[0, 0, 1], [3, 0, 1], [3, 3, 1], [0, 3, 1.0]]), turn, axis=0)
     (panel,) = find_convex_parts(corners, np.array([[0, 1, 2], [0, 2, 3]]))
     some = ConvexBlockers.from_bodies([ConvexBody([panel], 0)], 4, device=device)
-    placed = some.placed(wp.array(corners[None], dtype=wp.vec3, device=device))
+    placed = some.place(wp.array(corners[None], dtype=wp.vec3, device=device))
     points = np.array([[0, 1, 0], [1, 0, 0], [0, 2, 2], [1, 1, 0.0]])
     directions = np.tile([0, 0, 1.0], (16, 1)) * np.where(np.arange(16) < 8, 1, -1)[:, None]
     arguments = wp.array(points[None], dtype=wp.vec3, device=device), placed, some, directions
@@ -146,7 +146,7 @@ def test_prisms_of_a_body_cover_their_seam_once(device):
     parts = find_convex_parts(bracket.vertices, bracket.faces)
     assert [part.is_seam for part in parts] == [False, False, True]
     some = ConvexBlockers.from_bodies([ConvexBody(parts, 0)], len(bracket.vertices), device=device)
-    placed = some.placed(wp.array(bracket.vertices[None], dtype=wp.vec3, device=device))
+    placed = some.place(wp.array(bracket.vertices[None], dtype=wp.vec3, device=device))
     points = np.array([[-1.5, -0.7, 1.8], [-0.6, -0.9, -1.2]])  # from outside the notch
     solids = [bracket.vertices[part.corners] for part in parts[:2]]
     for point in points:
@@ -171,7 +171,7 @@ def test_pieces_of_a_body_are_blockers_of_their_own(device):
         (part,) = find_convex_parts(mesh.vertices, mesh.faces)
         parts.append(part._replace(corners=part.corners + starts[number], piece=number))
     some = ConvexBlockers.from_bodies([ConvexBody(parts, 0)], int(starts[-1]), device=device)
-    placed = some.placed(wp.array(np.concatenate(VERTICES)[None], dtype=wp.vec3, device=device))
+    placed = some.place(wp.array(np.concatenate(VERTICES)[None], dtype=wp.vec3, device=device))
     points = np.array([[0.4, 0.2, -0.9], [0.5, 3.0, 0.3]])
     got = part_coverage(wp.array(points[None], dtype=wp.vec3, device=device), placed, some, DIRECTIONS).numpy()[0]
     for point, found in zip(points, got, strict=True):
@@ -205,7 +205,7 @@ def test_parts_block_no_light_of_receivers_that_lie_on_them(point, normal, block
         parts.append(part._replace(corners=part.corners + 8 * number, piece=number))
     some = ConvexBlockers.from_bodies([ConvexBody(parts, 0)], 16, device=device)
     vertices = np.concatenate([mesh.vertices for mesh in meshes]) + shift
-    placed = some.placed(wp.array(vertices[None], dtype=wp.vec3, device=device))
+    placed = some.place(wp.array(vertices[None], dtype=wp.vec3, device=device))
     at, facing = (wp.array(np.array([[v]]), dtype=wp.vec3, device=device) for v in (np.add(point, shift), normal))
     got = part_coverage(at, placed, some, DIRECTIONS, horizon_normals=facing, on_surface=True).numpy()[0, 0, :, 0]
     is_above = DIRECTIONS @ normal > 0
@@ -225,7 +225,7 @@ def test_segments_of_bent_tubes_block_no_light_of_the_surface_they_stand_for(hei
     at, facing = (wp.array([[v]], dtype=wp.vec3, device=device) for v in ((-0.3, height, 0.2), (0, 1, 0)))
     for gap, shares in ((0.0, 1.0 if height < 0.1 else 0.0), (0.012 / radius, 0.0)):
         some = ConvexBlockers.from_bodies([ConvexBody([part._replace(gap=gap)], 0)], 8, device=device)
-        placed = some.placed(wp.array(SLAB.vertices[None], dtype=wp.vec3, device=device))
+        placed = some.place(wp.array(SLAB.vertices[None], dtype=wp.vec3, device=device))
         got = part_coverage(at, placed, some, DIRECTIONS, horizon_normals=facing, on_surface=True).numpy()[0, 0, :, 0]
         np.testing.assert_array_equal(got[DIRECTIONS[:, 1] > 0], shares)
 
@@ -251,7 +251,7 @@ def test_bodies_that_cast_no_shadow_block_nothing(device):
     vertices = wp.array(np.concatenate(VERTICES)[None], dtype=wp.vec3, device=device)
     some = blockers(device, blocks=(True, False))
     points = wp.array(POINTS[None], dtype=wp.vec3, device=device)
-    got = part_coverage(points, some.placed(vertices), some, DIRECTIONS).numpy()[0]
+    got = part_coverage(points, some.place(vertices), some, DIRECTIONS).numpy()[0]
     np.testing.assert_array_equal(got, of_kernel(POINTS, device, skip=1))
 
 
@@ -268,7 +268,7 @@ def test_instances_have_parts_of_their_own(device):
     positions = np.stack([np.concatenate(VERTICES), np.concatenate(VERTICES) + shift])
     points = np.stack([POINTS, POINTS + shift])
     some = blockers(device)
-    placed = some.placed(wp.array(positions, dtype=wp.vec3, device=device))
+    placed = some.place(wp.array(positions, dtype=wp.vec3, device=device))
     got = part_coverage(wp.array(points[:, :4], dtype=wp.vec3, device=device), placed, some, DIRECTIONS)
     np.testing.assert_allclose(got.numpy()[1], got.numpy()[0], rtol=0, atol=1e-4)  # rounding of 1e-7 beside edges
     np.testing.assert_array_equal(got.numpy()[0], of_kernel(POINTS[:4], device))
@@ -278,4 +278,4 @@ def test_errors_name_the_argument(device):
     with pytest.raises(ValueError, match=r"skip: got 2"):
         of_kernel(POINTS, device, skip=2)
     with pytest.raises(ValueError, match=r"positions: got"):
-        blockers(device).placed(wp.zeros((1, 3), dtype=wp.vec3, device=device))
+        blockers(device).place(wp.zeros((1, 3), dtype=wp.vec3, device=device))

@@ -96,7 +96,7 @@ def test_a_patch_sample_is_on_the_side_on_which_its_sphere_is(center, at_ground,
     radii, numbers = wp.full((1, 1), 0.2, dtype=wp.float32, device=device), wp.zeros(2, wp.int32, device=device)
     frames = wp.array([setting.frames(setting.vertices[0])], dtype=wp.vec3, device=device)
     fronts = find_fronts(points, points, None, NearestBlockers(centers, radii, numbers), frames, setting.planes)
-    np.testing.assert_allclose(fronts.weights.numpy()[0, :, 0], [at_ground, deep], atol=1e-6)
+    np.testing.assert_allclose(fronts.front_weights.numpy()[0, :, 0], [at_ground, deep], atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [1e-18, 1e-30, 1e18])

@@ -80,4 +80,4 @@ class SceneConvexParts:
 
     def place_parts(self, bodies: tuple[int, ...], positions: wp.array) -> PlacedParts:
         """Place the parts of some bodies by all vertices, [batch, vertex]. Differentiable in them."""
-        return self.blockers(bodies, bodies).placed(positions)
+        return self.blockers(bodies, bodies).place(positions)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import warp as wp
 
@@ -15,7 +16,7 @@ from warpshadow.device.batch import common_batch, cut, expand, expand_rows
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
 from warpshadow.pipeline.bounces.patches import Senders
-from warpshadow.pipeline.bounces.proxies import ProjectedPatches, Proxies
+from warpshadow.pipeline.bounces.proxies import PlacedProxies, Proxies
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.node import Call, Node, NodeStage
 from warpshadow.pipeline.receivers.groups import Group
@@ -26,6 +27,7 @@ from warpshadow.stages.bounces.plane_texels import find_texels
 from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance
 from warpshadow.stages.bounces.self_light import self_light
 from warpshadow.stages.bounces.sphere_light import sphere_light
+from warpshadow.stages.light.sums import add_light
 
 ALL_FLAT = "all that reflects is flat"  # why no body sends light to itself, in words
 
@@ -34,13 +36,21 @@ _SOFTNESS_OF_PARTS = 1.0
 that parts block have no proxy in them, which loses light, and light jumps as a proxy comes or goes."""
 
 
+class PortionForBounces(NamedTuple):
+    """Some receivers, and their visibility of bounced light."""
+
+    direct: wp.array  # direct light, vec3 of shape [batch, receiver]; if it is free, transfer vectors
+    group: Group
+    transmittance: CellTransmittance
+
+
 class OutgoingRadiance:
     """Radiosity of the patches in the forms that receivers gather; each is computed when first asked for.
 
     Args:
         proxies: Proxies of the bodies whose patches they are.
         radiosity: Of the patches, vec3 of shape [batch, patch].
-        projected_patches: The patches as receivers see them.
+        placed_proxies: Their proxies, in the world.
         frames: Where flat bodies are, vec3 of shape [batch, 3 · plane].
         patch_weights: Of the patches, vec3 of shape [batch, patch].
         texel_weights: Their sums of each texel of flat bodies, vec3 of shape [batch, texel]; None without any.
@@ -50,13 +60,13 @@ class OutgoingRadiance:
         self,
         proxies: Proxies,
         radiosity: wp.array,
-        projected_patches: ProjectedPatches,
+        placed_proxies: PlacedProxies,
         frames: wp.array,
         patch_weights: wp.array,
         texel_weights: wp.array | None,
     ):
         self.proxies, self.senders, self.radiosity = proxies, proxies.senders, radiosity
-        self.projected_patches, self.frames = projected_patches, frames
+        self.placed_proxies, self.frames = placed_proxies, frames
         self.patch_weights, self.texel_weights = patch_weights, texel_weights
 
     def of_body(self, body: int) -> wp.array:
@@ -67,11 +77,13 @@ class OutgoingRadiance:
     @functools.cached_property
     def proxy_radiance(self) -> wp.array:
         """Light that proxies of patches send towards cells, vec4 of shape [batch, proxy, cell]."""
-        proxies, radiosity, patches = self.proxies, self.radiosity, self.projected_patches
+        proxies, radiosity, placed_proxies = self.proxies, self.radiosity, self.placed_proxies
         if proxies.overlays is not None:
-            radiosity = overlaid_radiosity(radiosity, cut(patches.centers, 0, radiosity.shape[1]), *proxies.overlays)
+            radiosity = overlaid_radiosity(
+                radiosity, cut(placed_proxies.centers, 0, radiosity.shape[1]), *proxies.overlays
+            )
         return find_proxy_radiance(
-            radiosity, patches.areas, self.patch_weights, self.senders.areas, *proxies.seen_patches
+            radiosity, placed_proxies.projected_areas, self.patch_weights, self.senders.areas, *proxies.seen_patches
         )
 
     @functools.cached_property
@@ -89,7 +101,7 @@ class Gathering:
         senders: The bodies whose patches send light.
         self_form_factors: Form factors of bodies for themselves.
         item_text: Number of receivers, in words.
-        where: Put after the names of its stages.
+        suffix: Ends the names of its stages.
         why_not: Why nobody asks for it, in words; empty if somebody does.
         only_others: Leave out light from a body to itself.
     Attributes:
@@ -102,7 +114,7 @@ class Gathering:
         senders: Senders,
         self_form_factors: SelfFormFactors,
         item_text: str | Callable[[], str],
-        where: str = "",
+        suffix: str = "",
         why_not: str = "",
         only_others: bool = False,
     ):
@@ -116,25 +128,24 @@ class Gathering:
         )
         names = "self light", "plane light", "sphere light"
         stages = tuple(
-            NodeStage(f"{name}{where}", item_text, why_not or why) for name, why in zip(names, idle, strict=True)
+            NodeStage(f"{name}{suffix}", item_text, why_not or why) for name, why in zip(names, idle, strict=True)
         )
         functions = self._from_itself, self._from_planes, self._from_spheres
         first = 1 if only_others else 0
         self.stages, self._functions = stages[first:], functions[first:]
 
-    def lights(
-        self, node: Node, call: Call, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance
-    ) -> list[wp.array]:
-        """Bounced light of a group by each path: its own body, planes, spheres; vec3 of shape [batch, receiver].
+    def add_bounced(self, node: Node, call: Call, portion: PortionForBounces, outgoing: OutgoingRadiance) -> wp.array:
+        """Add bounced light to direct light of a portion, by each path: its own body, planes, spheres.
 
-        ``node`` has the stages.
+        ``node`` has the stages. The result is vec3 of shape [batch, receiver].
         """
-        result = []
+        lights = [portion.direct]
         for stage, function in zip(self.stages, self._functions, strict=True):
             if not stage.idle:
                 with node.timed(call, stage):
-                    result.append(function(group, transmittance, outgoing))
-        return [light for light in result if light is not None]
+                    bounced = function(portion.group, portion.transmittance, outgoing)
+                lights += [] if bounced is None else [bounced]
+        return add_light(*lights)
 
     def _from_itself(self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
         own = group.own
@@ -158,28 +169,28 @@ class Gathering:
         # ball on a ground lost 4% of the ground's light by the former.
         middles = fibonacci(len(transmittance.directions))
         arguments = (
-            fronts.lifted,
+            fronts.lifted_points,
             group.normals,
             transmittance.transmittance_nonplanar,
             outgoing.frames,
             outgoing.texels,
             planes.blockers,
         )
-        coverages, weights = transmittance.part_coverages, fronts.weights
-        return plane_light(*arguments, middles, coverages=coverages, fronts=weights, skip=skip)
+        options = {"coverages": transmittance.part_coverages, "front_weights": fronts.front_weights, "skip": skip}
+        return plane_light(*arguments, middles, **options)
 
     def _from_spheres(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance
     ) -> wp.array | None:
         if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):
             return None
-        projected_patches, proxy_radiance = outgoing.projected_patches, outgoing.proxy_radiance
+        placed_proxies, proxy_radiance = outgoing.placed_proxies, outgoing.proxy_radiance
         softness = self._visibility.softness
         if group.convex_parts_around is not None:
             softness = max(softness, _SOFTNESS_OF_PARTS)
-        count = common_batch({"geometry": group.points, "light": proxy_radiance, "proxies": projected_patches.radii})
+        count = common_batch({"geometry": group.points, "light": proxy_radiance, "proxies": placed_proxies.radii})
         points, normals = expand(group.points, count), expand(group.normals, count)
-        centers, radii = expand(projected_patches.centers, count), expand(projected_patches.radii, count)
+        centers, radii = expand(placed_proxies.centers, count), expand(placed_proxies.radii, count)
         return sphere_light(
             points,
             normals,
@@ -192,8 +203,8 @@ class Gathering:
             softness=softness,
             merging=self._visibility.merging,
             skip=outgoing.proxies.span_of(group.body),
-            clusters=projected_patches.clusters
-            if radii is projected_patches.radii and centers is projected_patches.centers
+            clusters=placed_proxies.clusters
+            if radii is placed_proxies.radii and centers is placed_proxies.centers
             else None,
-            tangent_planes=projected_patches.tangent_planes,
+            tangent_planes=placed_proxies.tangent_planes,
         )

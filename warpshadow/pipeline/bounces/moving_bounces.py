@@ -23,16 +23,15 @@ import warp as wp
 
 from warpshadow.device.batch import cut
 from warpshadow.pipeline.bodies.reflectance import Materials
-from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance, find_cell_transmittance
-from warpshadow.pipeline.bounces.gathering import ALL_FLAT, Gathering, OutgoingRadiance
+from warpshadow.pipeline.bounces.cell_transmittance import find_cell_transmittance
+from warpshadow.pipeline.bounces.gathering import ALL_FLAT, Gathering, OutgoingRadiance, PortionForBounces
 from warpshadow.pipeline.bounces.patches import OF_PATCH_SAMPLES, ScenePatches, Senders, lit_patch_samples
-from warpshadow.pipeline.bounces.proxies import ProjectedPatches, Proxies
+from warpshadow.pipeline.bounces.proxies import PlacedProxies, Proxies
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.node import Call, Node, NodeStage, identity
-from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
-from warpshadow.pipeline.shading.method import LightInput
+from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.sphere_method import (
     LitPortion,
     PortionedShading,
@@ -49,44 +48,29 @@ from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.receivers.find import Receivers
 
 
-class VisibilityOfPortion(NamedTuple):
-    """Some receivers, and their visibility, which holds for any free light."""
-
-    transfer: wp.array  # of direct light, [batch, receiver, coefficient]
-    group: Group
-    transmittance: CellTransmittance
-
-
-class DirectLightOfPortion(NamedTuple):
-    """Some receivers in direct light, and their visibility of bounced light."""
-
-    direct: wp.array  # vec3 of shape [batch, receiver]
-    group: Group
-    transmittance: CellTransmittance
-
-
 class TransferForBounces(PortionedTransfer):
-    """Visibility of receivers for direct and bounced light, a list of :class:`VisibilityOfPortion`: in free light."""
+    """Receivers in free light, a list of :class:`PortionForBounces`: transfer vectors, and transmittance of cells."""
 
-    def result_of(self, portion: LitPortion) -> VisibilityOfPortion:
+    def result_of(self, portion: LitPortion) -> PortionForBounces:
         """Visibility of a portion."""
-        return VisibilityOfPortion(portion.result, portion.group, _find_transmittance(self.method, portion))
+        return _portion_for_bounces(self.method, portion)
 
 
 class ShadingForBounces(PortionedShading):
-    """Direct light of receivers, and their visibility of bounced light, a list of :class:`DirectLightOfPortion`."""
+    """Receivers in known light, a list of :class:`PortionForBounces`: direct light, and transmittance of cells."""
 
     def compute(self, call: Call) -> Any:
         """Shade all portions."""
         return list(self.portions(call))
 
-    def result_of(self, portion: LitPortion) -> DirectLightOfPortion:
+    def result_of(self, portion: LitPortion) -> PortionForBounces:
         """Light and visibility of a portion."""
-        return DirectLightOfPortion(portion.result, portion.group, _find_transmittance(self.method, portion))
+        return _portion_for_bounces(self.method, portion)
 
 
-def _find_transmittance(method: SphereMethod, portion: LitPortion) -> CellTransmittance:
-    return find_cell_transmittance(method, portion.group, portion.visibility, portion.spheres)
+def _portion_for_bounces(method: SphereMethod, portion: LitPortion) -> PortionForBounces:
+    transmittance = find_cell_transmittance(method, portion.group, portion.visibility, portion.spheres)
+    return PortionForBounces(portion.result, portion.group, transmittance)
 
 
 class PortionedDirectLight(Node):
@@ -96,7 +80,7 @@ class PortionedDirectLight(Node):
         visibility: Visibility of the receivers in free light, or their direct light if it is known.
         free_light: Free light projected for the method; None if light is known.
         item_text: Number of receivers, in words.
-        where: Put after the name of its stage.
+        suffix: Ends the name of its stage.
         others: More that it depends on.
         stages: Further ones, as for :class:`Node`.
     """
@@ -106,13 +90,13 @@ class PortionedDirectLight(Node):
         visibility: TransferForBounces | ShadingForBounces,
         free_light: Node | None,
         item_text: str | Callable[[], str],
-        where: str = "",
+        suffix: str = "",
         others: tuple[Node | None, ...] = (),
         stages: tuple[NodeStage, ...] = (),
     ):
         self._visibility = visibility
         if free_light is not None:
-            self._shading = NodeStage(f"shading{where}", item_text, inputs=(visibility, free_light))
+            self._shading = NodeStage(f"shading{suffix}", item_text, inputs=(visibility, free_light))
             stages = self._shading, *stages
         super().__init__("", None, free_light, *others, extra_inputs=(visibility,), stages=stages)
 
@@ -121,18 +105,15 @@ class PortionedDirectLight(Node):
         (free_light,) = self.values(call)
         return [self._light(call, portion, free_light) for portion in self._visibility.value(call)]
 
-    def _light(
-        self, call: Call, portion: VisibilityOfPortion | DirectLightOfPortion, free_light: ProjectedLight | None
-    ) -> DirectLightOfPortion:
-        if isinstance(portion, DirectLightOfPortion):
+    def _light(self, call: Call, portion: PortionForBounces, free_light: ProjectedLight | None) -> PortionForBounces:
+        if free_light is None:
             return portion
-        assert free_light is not None
         with self.timed(call, self._shading):
-            direct = self._visibility.method.shade_transfer(portion.transfer, portion.group, free_light)
-        return DirectLightOfPortion(direct, portion.group, portion.transmittance)
+            direct = self._visibility.method.shade_transfer(portion.direct, portion.group, free_light)
+        return portion._replace(direct=direct)
 
 
-def _patch_weights(senders: Senders, visibility: list[VisibilityOfPortion | DirectLightOfPortion]) -> PatchWeights:
+def _patch_weights(senders: Senders, visibility: list[PortionForBounces]) -> PatchWeights:
     """Weights of patch samples and patches by how open they are."""
     portions = [
         find_mean_transmittance(
@@ -146,7 +127,7 @@ def _patch_weights(senders: Senders, visibility: list[VisibilityOfPortion | Dire
     return find_patch_weights(join_portions(portions), senders.mean, senders.patch_of_sample)
 
 
-def _add_emitted(lit: list[DirectLightOfPortion], emitted: wp.array) -> list[DirectLightOfPortion]:
+def _add_emitted(lit: list[PortionForBounces], emitted: wp.array) -> list[PortionForBounces]:
     """Add direct light of emitters, vec3 of shape [batch, receiver], to that of portions."""
     result, first = [], 0
     for portion in lit:
@@ -162,7 +143,7 @@ class PatchSampleNodes(NamedTuple):
     points: LitPoints
     visibility: TransferForBounces | ShadingForBounces  # of the patch samples
     frames: Node  # of flat bodies
-    projected_patches: Node  # patches as receivers see them
+    placed_proxies: Node  # proxies of the patches, in the world
     weights: Node  # of patch samples and patches, by how open they are
 
 
@@ -179,64 +160,52 @@ class Radiosity(Node):
         albedo: Node,
         patch_samples: PatchSampleNodes,
     ):
-        _, _, frames, projected_patches, weights = patch_samples
-        self._count, self._proxies, self._self_form_factors, self._gathering = (
-            count,
-            proxies,
-            self_form_factors,
-            gathering,
-        )
-        senders = proxies.senders
+        _, _, frames, placed_proxies, weights = patch_samples
+        self._count, self._proxies, senders = count, proxies, proxies.senders
+        self._self_form_factors, self._gathering = self_form_factors, gathering
         item_text = f"{len(senders.areas):,} patches"
         idle = ALL_FLAT if all(senders.merged_scene.is_flat[body] for body in senders.bodies) else ""
         self._reflection = NodeStage("radiosity", item_text)
         self._self_reflection = NodeStage("self light of patches", item_text, idle)
         stages = self._reflection, self._self_reflection, *gathering.stages
-        super().__init__("", None, lit, albedo, projected_patches, frames, weights, stages=stages)
+        super().__init__("", None, lit, albedo, placed_proxies, frames, weights, stages=stages)
 
     def compute(self, call: Call) -> OutgoingRadiance:
         """Reflect direct light, then light that has bounced once, and so on; more often between patches of one body."""
-        lit, albedo, projected_patches, frames, weights = self.values(call)
+        lit, albedo, placed_proxies, frames, weights = self.values(call)
         senders, count = self._proxies.senders, self._count
-        between = (
-            None
-            if self._self_reflection.idle
-            else self._self_form_factors.between_patches(senders, [portion.group for portion in lit])
-        )
-        if between is not None and between.is_zero:
-            between = None
+        self_factors = None  # between patches of one body
+        if not self._self_reflection.idle:
+            self_factors = self._self_form_factors.between_patches(senders, [portion.group for portion in lit])
+        if self_factors is not None and self_factors.is_zero:
+            self_factors = None
 
         planes = self._proxies.planes
         texel_weights = None if planes is None else sum_weights(weights.weights, planes.blockers)
 
-        def sent(radiosity: wp.array) -> OutgoingRadiance:
-            return OutgoingRadiance(self._proxies, radiosity, projected_patches, frames, weights.weights, texel_weights)
+        def outgoing_of(radiosity: wp.array) -> OutgoingRadiance:
+            return OutgoingRadiance(self._proxies, radiosity, placed_proxies, frames, weights.weights, texel_weights)
 
         def radiosity_by_others(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""
             if radiosity is None:
                 portions = [portion.direct for portion in lit]
             else:
-                outgoing = sent(radiosity)
-                portions = [self._light(call, portion, outgoing) for portion in lit]
+                outgoing = outgoing_of(radiosity)
+                portions = [self._gathering.add_bounced(self, call, portion, outgoing) for portion in lit]
             with self.timed(call, self._reflection):
                 return patch_radiosity(albedo, join_portions(portions), senders.mean, weights.shares)
 
         def add_radiosity_by_self(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
-            if between is None or radiosity is None:
+            if self_factors is None or radiosity is None:
                 return by_others
             with self.timed(call, self._self_reflection):
-                return patch_radiosity(albedo, radiosity, between, addend=by_others)
+                return patch_radiosity(albedo, radiosity, self_factors, addend=by_others)
 
-        self_bounces = 0 if between is None else SELF_BOUNCES
-        return sent(
+        self_bounces = 0 if self_factors is None else SELF_BOUNCES
+        return outgoing_of(
             after_bounces(count, radiosity_by_others, add_radiosity_by_self, senders.areas, self_bounces=self_bounces)
         )
-
-    def _light(self, call: Call, portion: DirectLightOfPortion, outgoing: OutgoingRadiance) -> wp.array:
-        """Light of a portion of the patch samples past its own body, from the sky and from others."""
-        bounced = self._gathering.lights(self, call, portion.group, portion.transmittance, outgoing)
-        return add_light(portion.direct, *bounced)
 
 
 class BouncedShading(PortionedDirectLight):
@@ -263,13 +232,8 @@ class BouncedShading(PortionedDirectLight):
         """Light all portions, directly and by the patches' radiosity."""
         free_light, outgoing = self.values(call)
         portions = self._visibility.value(call) if self._visibility.caches else self._visibility.portions(call)
-        return join_portions(
-            [self._bounced(call, self._light(call, portion, free_light), outgoing) for portion in portions]
-        )
-
-    def _bounced(self, call: Call, portion: DirectLightOfPortion, outgoing: OutgoingRadiance) -> wp.array:
-        bounced = self._gathering.lights(self, call, portion.group, portion.transmittance, outgoing)
-        return add_light(portion.direct, *bounced)
+        lit = (self._light(call, portion, free_light) for portion in portions)
+        return join_portions([self._gathering.add_bounced(self, call, portion, outgoing) for portion in lit])
 
 
 class MovingBounces:
@@ -298,10 +262,7 @@ class MovingBounces:
             materials: Reflectance of the bodies.
         """
         method, senders = self._method, self._patches.senders(materials)
-        projected_light, visibility_light = (
-            method.projected_light(points, light),
-            method.light_of_visibility(points, light),
-        )
+        projected_light = method.projected_light(points, light)
         if not senders.bodies:
             direct = PortionedShading(method, points, projected_light, light)
             return Node("bounces", identity, direct, idle="every body is black")
@@ -309,7 +270,7 @@ class MovingBounces:
         make_visibility = functools.partial(
             TransferForBounces if light.is_free else ShadingForBounces,
             method,
-            projected_light=visibility_light,
+            projected_light=method.light_of_visibility(points, light),
             light=light,
         )
         free_light = projected_light if light.is_free else None
@@ -320,8 +281,7 @@ class MovingBounces:
         )
         radiosity = self._radiosity(of_patch_samples, free_light, proxies, materials)
         item_text = functools.partial(receiver_text, points.weak)
-        at_points = self._gathering(senders, item_text)
-        return BouncedShading(visibility, free_light, item_text, radiosity, at_points)
+        return BouncedShading(visibility, free_light, item_text, radiosity, self._gathering(senders, item_text))
 
     def _patch_samples(
         self,
@@ -332,20 +292,16 @@ class MovingBounces:
         """Nodes of the patch samples of the bodies around points."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
 
-        def project(
-            patch_samples: Receivers, visibility: list[VisibilityOfPortion | DirectLightOfPortion], *arguments: Any
-        ) -> ProjectedPatches:
-            return proxies.projected_patches(
-                patch_samples, [portion.transmittance for portion in visibility], *arguments
-            )
+        def project(patch_samples: Receivers, visibility: list[PortionForBounces], *arguments: Any) -> PlacedProxies:
+            return proxies.place(patch_samples, [portion.transmittance for portion in visibility], *arguments)
 
         arguments = senders, points, proxies.nearest_spheres
         lit_samples = points.cached("patch samples beside proxies", proxies, lambda: lit_patch_samples(*arguments))
         visibility = make_visibility(lit_samples)
         frames = Node("", planes.blockers.frames if planes else lambda _: None, points.vertices)
-        projected_patches = Node("", project, lit_samples.receivers_node, visibility, spheres, frames)
+        placed_proxies = Node("", project, lit_samples.receivers_node, visibility, spheres, frames)
         weights = Node("", functools.partial(_patch_weights, senders), visibility)
-        return PatchSampleNodes(lit_samples, visibility, frames, projected_patches, weights)
+        return PatchSampleNodes(lit_samples, visibility, frames, placed_proxies, weights)
 
     def _radiosity(
         self, patch_samples: PatchSampleNodes, free_light: Node | None, proxies: Proxies, materials: Materials
@@ -359,8 +315,8 @@ class MovingBounces:
         if materials.emission:
             lit = Node("", _add_emitted, lit, self._method.light_of_emitters(patch_samples.points, materials))
         albedo = self._patches.albedo(materials, senders.bodies)
-        among_senders = self._gathering(senders, *arguments, why_not, only_others=True)
-        return Radiosity(self._count, proxies, self._self_form_factors, among_senders, lit, albedo, patch_samples)
+        gathering = self._gathering(senders, *arguments, why_not, only_others=True)
+        return Radiosity(self._count, proxies, self._self_form_factors, gathering, lit, albedo, patch_samples)
 
     def _gathering(self, senders: Senders, *arguments: Any, **options: Any) -> Gathering:
         return Gathering(self._method.visibility, senders, self._self_form_factors, *arguments, **options)

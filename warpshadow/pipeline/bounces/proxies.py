@@ -16,7 +16,7 @@ from warpshadow.device.constants import constant
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
 from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.bounces.scene_overlays import find_overlays
-from warpshadow.pipeline.shading.transfers import join_portions
+from warpshadow.pipeline.shading.transfers import join_rows
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, tilt_normals_off_planes
 from warpshadow.stages.bounces.proxies import find_depths, place_proxies
 from warpshadow.stages.bounces.proxy_radiance import patches_of_clusters
@@ -35,10 +35,12 @@ class SenderPlanes(NamedTuple):
     index_of_body: dict[int | None, int]  # of each among them, by the number of the body
 
 
-class ProjectedPatches(NamedTuple):
-    """Patches of bodies that are not flat, as their proxy spheres send them."""
+class PlacedProxies(NamedTuple):
+    """Proxy spheres of patches of bodies that are not flat, in the world."""
 
-    areas: wp.array  # part of its area that each shows towards each cell, [batch, patch, cell]; 0 on flat bodies
+    projected_areas: (
+        wp.array
+    )  # part of its area that each shows towards each cell, [batch, patch, cell]; 0 on flat bodies
     centers: wp.array  # of the spheres, vec3 of shape [batch, patch + sphere of dark bodies]
     radii: wp.array  # likewise, 0 for patches of flat bodies
     clusters: ClusterTree
@@ -156,14 +158,14 @@ class Proxies:
         """Sphere nearest to the patch of each patch sample, −1 for none: int32 of shape [patch sample]."""
         return self._blockers[0][self.senders.patch_of_sample]
 
-    def projected_patches(
+    def place(
         self,
         patch_samples: Receivers,
         transmittances: list[CellTransmittance],
         spheres: tuple[wp.array, wp.array],
         frames: wp.array | None,
-    ) -> ProjectedPatches:
-        """Patches as receivers see them.
+    ) -> PlacedProxies:
+        """Place the proxies in the world, with the areas that receivers see of their patches.
 
         Args:
             patch_samples: Where they are lit.
@@ -176,23 +178,23 @@ class Proxies:
         if planes is not None:
             numbers, points, device = self.nearest_spheres, patch_samples.points, normals.device
             of_patch_samples = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
-            fronts = find_fronts(points, normals, None, of_patch_samples, frames, planes.blockers).weights
+            front_weights = find_fronts(points, normals, None, of_patch_samples, frames, planes.blockers).front_weights
             if self.overlays is not None:
                 numbers = np.where(self.overlays[1][senders.patch_of_sample] > 0, np.int32(-1), numbers)
-            normals = tilt_normals_off_planes(points, normals, radii, numbers, fronts, frames, planes.blockers)
+            normals = tilt_normals_off_planes(points, normals, radii, numbers, front_weights, frames, planes.blockers)
         directions, transmittance = transmittances[0].directions, _self_transmittance(transmittances)
         mean_points = multiply(senders.mean, patch_samples.points)
         mean_normals = multiply(senders.mean, patch_samples.normals)
-        placed = place_proxies(mean_points, mean_normals, radii, *self._blockers, self._depths)
+        proxies = place_proxies(mean_points, mean_normals, radii, *self._blockers, self._depths)
         if self.black_bodies:
             others = self.merged_scene.spheres_of(self.black_bodies, spheres)
             counts = [len(senders.areas), others[1].shape[1]]
-            placed = tuple(concatenate(pair, counts) for pair in zip(placed, others, strict=True))
+            proxies = tuple(concatenate(pair, counts) for pair in zip(proxies, others, strict=True))
         areas = find_projected_areas(normals, transmittance, self._mean_of_seen, directions)
-        clusters = find_clusters(*placed, self.merging)
-        proxies = clusters.nodes.centers, *self.patches_of_clusters, self._tolerances
-        tangent_planes = find_tangent_planes(mean_points, mean_normals, *proxies)
-        return ProjectedPatches(areas, *placed, clusters, tangent_planes)
+        clusters = find_clusters(*proxies, self.merging)
+        of_clusters = clusters.nodes.centers, *self.patches_of_clusters, self._tolerances
+        tangent_planes = find_tangent_planes(mean_points, mean_normals, *of_clusters)
+        return PlacedProxies(areas, *proxies, clusters, tangent_planes)
 
 
 def _self_transmittance(transmittances: list[CellTransmittance]) -> wp.array | None:
@@ -205,5 +207,4 @@ def _self_transmittance(transmittances: list[CellTransmittance]) -> wp.array | N
         else portion.transmittance_self
         for portion in transmittances
     ]
-    joined = join_portions([row.reshape((len(row), -1)) for row in rows])
-    return joined.reshape((len(joined), -1, rows[0].shape[2]))
+    return join_rows(rows)

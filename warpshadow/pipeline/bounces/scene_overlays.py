@@ -36,9 +36,9 @@ def find_overlays(senders: Senders, depths: np.ndarray) -> Overlays | None:
     from scipy.spatial import cKDTree
 
     bodies, is_flat = senders.merged_scene.scene.bodies, senders.merged_scene.is_flat
-    placed = [(bodies[number], item) for number, item in zip(senders.bodies, senders.patches, strict=True)]
-    normals = np.concatenate([item.normals @ body.rotation_matrix().T for body, item in placed])
-    centers = np.concatenate([body.to_world(item.centers) for body, item in placed])
+    bodies_and_patches = [(bodies[number], item) for number, item in zip(senders.bodies, senders.patches, strict=True)]
+    normals = np.concatenate([item.normals @ body.rotation_matrix().T for body, item in bodies_and_patches])
+    centers = np.concatenate([body.to_world(item.centers) for body, item in bodies_and_patches])
     radii = np.sqrt(senders.areas / 2)
     is_nonplanar = ~is_flat[senders.body_of_patch]
     weights = np.zeros((0, 3))

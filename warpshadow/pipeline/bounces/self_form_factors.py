@@ -57,8 +57,8 @@ class SelfFormFactors:
             from scipy.sparse import vstack
 
             of_patch_samples = vstack([self._of_group(senders, group) for group in patch_samples])
-            between = senders.mean.to_scipy() @ of_patch_samples
-            self._between[senders] = SparseMatrix.from_matrix(between, device=senders.merged_scene.device)
+            form_factors = senders.mean.to_scipy() @ of_patch_samples
+            self._between[senders] = SparseMatrix.from_matrix(form_factors, device=senders.merged_scene.device)
         return self._between[senders]
 
     def _of_group(self, senders: Senders, group: Group) -> csr_matrix:

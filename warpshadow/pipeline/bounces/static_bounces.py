@@ -282,10 +282,13 @@ class StaticBounces:
             receiver_weights, to_cache_points, openness = zip(*factors, strict=True)
             means, is_buried = senders.mean.to_scipy(), seen_by_patch_samples.is_buried
             mean = mean_outside(means, is_buried)[senders.nearest_open_patches(means @ ~is_buried > 0)]
-            between = (mean @ seen_by_patch_samples.factors).tocoo()
-            is_same_body = np.equal(*(senders.body_of_patch[patches] for patches in between.coords))
+            patch_factors = (mean @ seen_by_patch_samples.factors).tocoo()
+            is_same_body = np.equal(*(senders.body_of_patch[patches] for patches in patch_factors.coords))
             within_bodies, between_bodies = (
-                coo_matrix((between.data[which], (between.row[which], between.col[which])), between.shape)
+                coo_matrix(
+                    (patch_factors.data[which], (patch_factors.row[which], patch_factors.col[which])),
+                    patch_factors.shape,
+                )
                 for which in (is_same_body, ~is_same_body)
             )
             return _GeometryFactors(

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -14,31 +14,28 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLookup
+from warpshadow.pipeline.methods.cell_lobes import CellLobes
 from warpshadow.pipeline.methods.sharpest_cells import SharpestCells, find_share_of_sharpest_light, find_sharpest_cells
-from warpshadow.pipeline.node import Call, Input, Node, field_of
+from warpshadow.pipeline.node import Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, Group
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
-from warpshadow.pipeline.shading.method import LightInput, LitLobes
+from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells, project_on_cells
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
 from warpshadow.pipeline.shading.shell_patches import PATCHES, ShellPatches, project_on_shell
-from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, PortionedVisibility, SphereMethod
-from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions
+from warpshadow.pipeline.shading.sphere_method import SphereMethod
+from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT
 from warpshadow.scene.blockers import blocking_planes
-from warpshadow.stages.gloss.reflection import find_blocked_radiance
-from warpshadow.stages.gloss.suns import Suns, find_sun_transmittance
-from warpshadow.stages.gloss.transmittance import interpolate_transmittance
 from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.light.cached_cells import CachedRows, cell_transfer, shade_cached_cells
 from warpshadow.stages.light.light_samples import CellSamples, cell_samples, even_samples, sample_map
-from warpshadow.stages.light.shading import shade, shade_cells
+from warpshadow.stages.light.shading import shade_cells
 from warpshadow.stages.light.transfer import directional_transfer
 from warpshadow.stages.planes.coverage import plane_coverage
 from warpshadow.stages.planes.partial_cells import coverage_of_light
 from warpshadow.stages.raster.sides import split_sides
 from warpshadow.stages.rays.ray_tracing import trace_cells
-from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.self_visibility.gather import multiply_transmittances
 from warpshadow.stages.self_visibility.sun_cells import trace_sun_cells
 from warpshadow.stages.visibility import directional
@@ -200,8 +197,12 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if planes is None or not group.is_blocked_by_planes:
             return visibility
         horizon_normals = group.normals if group.cached_rows is None else None
-        fronts, points = group.fronts_of_planes
-        options: dict[str, Any] = {"horizon_normals": horizon_normals, "fronts": fronts, "skip": planes.skip}
+        front_weights, points = group.fronts_of_planes
+        options: dict[str, Any] = {
+            "horizon_normals": horizon_normals,
+            "front_weights": front_weights,
+            "skip": planes.skip,
+        }
         covered = self._coverages(
             functools.partial(plane_coverage, points, planes.frames, planes.planes, **options), projected_light
         )
@@ -277,78 +278,16 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         towards, scales = self.free_basis.blocking_directions, self._scales(sharpest.relative_radius)
         return find_share_of_sharpest_light(group, sharpest, towards, **scales)
 
-    def lobe_transmittance(self, lobes: LitLobes, directions: Node) -> Node:
-        """Transmittance towards the samples of lobes, between cells; in known light, between where their light is."""
-        transmittance, projected_light = self._cell_transmittance(lobes)
-        item_text = functools.partial(receiver_text, lobes.points.weak)
-        arguments = transmittance, lobes.points.receivers_node, directions, projected_light
-        return Node("transmittance of lobes", _lobe_transmittance, *arguments, items=item_text)
-
-    def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
-        """Mean radiance of the blockers of receivers, by their light with bounces and without."""
-        transmittance, projected_light = self._cell_transmittance(lobes)
-        free = lobes.light if lobes.light.is_free else None
-        arguments = transmittance, lobes.points.receivers_node, projected_light, diffuse, free
-        return Node("light of blockers", self._mean_radiance_of_blockers, *arguments)
-
-    def sun_transmittance(self, lobes: LitLobes, suns: Suns) -> Node:
-        """Transmittance towards suns, of their cells."""
-        transmittance, projected_light = self._cell_transmittance(lobes)
-        arguments = transmittance, lobes.points.receivers_node, suns, self._directions, projected_light
-        item_text = functools.partial(receiver_text, lobes.points.weak)
-        return Node("transmittance of suns", _sun_transmittance, *arguments, items=item_text)
-
-    def _mean_radiance_of_blockers(
-        self,
-        portions: list[wp.array],
-        receivers: Receivers,
-        projected_light: ProjectedCells,
-        diffuse: wp.array,
-        free: wp.array | None,
-    ) -> wp.array:
-        if not diffuse.size:
-            return diffuse
-        count = len(projected_light.blocking_directions)
-        transmittance = _join_transmittance(portions, count)
-        of_cells = transfer = directional_transfer(transmittance, receivers.normals, projected_light.cosine_directions)
-        if projected_light.patches is not None:
-            arguments = receivers.points, receivers.normals, transmittance, projected_light.blocking_directions
-            transfer = projected_light.patches.transfer(*arguments)
-        light = projected_light.coefficients if free is None else change_basis(free, self.native_from_basis)
-        assert light is not None
-        even = wp.full((1, count), wp.vec3(1.0), dtype=wp.vec3, device=diffuse.device)
-        direct, openness = shade(transfer, light, maximum=LARGEST_COEFFICIENT), shade(of_cells, even)
-        return find_blocked_radiance(diffuse, direct, openness)
+    @functools.cached_property
+    def lobes(self) -> CellLobes:
+        """Visibility in lobes, between cells."""
+        return CellLobes(self, self._directions)
 
     def known_shading(self, points: LitPoints, light: LightInput) -> Node:
-        """Direct known light on points."""
-        if not self._shades_with_cells(points):
+        """Direct known light on points; where no light bounces, with the cells of bodies that shine."""
+        if self.merged_scene.scene.bounces or points.materials.roughness is None:
             return super().known_shading(points, light)
-        return field_of(self._shading_with_cells(points, light), "shading")
-
-    def _shades_with_cells(self, points: LitPoints) -> bool:
-        """Whether the transmittance of cells at bodies that shine comes with the shading of a view."""
-        return not self.merged_scene.scene.bounces and points.materials.roughness is not None
-
-    def _shading_with_cells(self, points: LitPoints, light: LightInput) -> Node:
-        """Node of the shading of points in known light, and of the transmittance of the glossy ones' cells."""
-        make = functools.partial(_ShadingWithCells, self, points, self.projected_light(points, light), light)
-        return self.cached_for_light("direct with cells", points, light, make)
-
-    def _cell_transmittance(self, lobes: LitLobes) -> tuple[Node, Node | ProjectedCells]:
-        """Node of the transmittance of cells, in portions, and the projected light that says which.
-
-        In known light that does not bounce the shading of the view has found it.
-        """
-        points, light = lobes.points, lobes.light
-        visibility_light = self.light_of_visibility(points, light)
-        if not light.is_free and self._shades_with_cells(lobes.all_points):
-            return field_of(self._shading_with_cells(lobes.all_points, light), "transmittance"), visibility_light
-
-        def in_cells() -> Node:
-            return _TransmittanceOfCells(self, points, visibility_light, None, suffix=" of gloss")
-
-        return points.cached("cells", light.visibility_key, in_cells), visibility_light
+        return field_of(self.lobes.shading(points, light), "shading")
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of the light of each cell that static bodies let through.
@@ -379,72 +318,6 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     def _even_samples(self) -> CellSamples:
         samples = even_samples(self.visibility.ray_count, self._directions)
         return cell_samples(samples, self._directions, device=self.merged_scene.device)
-
-
-class _ShadingAndTransmittance(NamedTuple):
-    """Shading of receivers, and their transmittance towards cells."""
-
-    shading: wp.array  # vec3 of shape [batch, receiver]
-    transmittance: list[wp.array]  # of portions of bodies that shine, float32 of shape [batch, receiver, direction]
-
-
-class _ShadingWithCells(PortionedShading):
-    """Shading of receivers, and the transmittance of cells at bodies that shine."""
-
-    def compute(self, call: Call) -> _ShadingAndTransmittance:
-        """Shade all portions."""
-        portions = list(self.portions(call))
-        of_glossy = [transmittance for _, transmittance in portions if transmittance is not None]
-        return _ShadingAndTransmittance(join_portions([shading for shading, _ in portions]), of_glossy)
-
-    def result_of(self, portion: LitPortion) -> tuple[wp.array, wp.array | None]:
-        """Shading of a portion, and the transmittance of its cells if its body shines."""
-        body = portion.group.body
-        is_glossy = body is not None and self.method.merged_scene.is_glossy[body]
-        return portion.result, _transmittance_of(portion) if is_glossy else None
-
-
-class _TransmittanceOfCells(PortionedVisibility):
-    """Transmittance of receivers towards cells."""
-
-    def result_of(self, portion: LitPortion) -> wp.array | None:
-        """Transmittance of the cells of a portion."""
-        return _transmittance_of(portion)
-
-
-def _transmittance_of(portion: LitPortion) -> wp.array | None:
-    """Transmittance of a portion past all bodies, float32 of shape [batch, receiver, direction]."""
-    assert isinstance(portion.visibility, CellVisibility)
-    return portion.visibility.transmittance_total
-
-
-def _lobe_transmittance(
-    portions: list[wp.array], receivers: Receivers, directions: wp.array, projected_light: ProjectedCells
-) -> wp.array:
-    count = len(projected_light.blocking_directions)
-    if not directions.size:
-        return wp.empty(directions.shape, dtype=wp.float32, device=directions.device)
-    transmittance = _join_transmittance(portions, count)
-    return interpolate_transmittance(transmittance, receivers.normals, directions, projected_light.cosine_directions)
-
-
-def _sun_transmittance(
-    portions: list[wp.array],
-    receivers: Receivers,
-    suns: Suns,
-    middles: np.ndarray,
-    projected_light: ProjectedCells,
-) -> wp.array:
-    if not receivers.points.size:
-        return wp.empty((1, 0, len(suns.directions)), dtype=wp.float32, device=receivers.points.device)
-    transmittance = _join_transmittance(portions, len(middles))
-    return find_sun_transmittance(transmittance, receivers.normals, suns, middles, projected_light.cosine_directions)
-
-
-def _join_transmittance(portions: list[wp.array], count: int) -> wp.array:
-    """Transmittance of all portions, [batch, receiver, direction]. Differentiable."""
-    rows = join_portions([portion.reshape((len(portion), -1)) for portion in portions])
-    return rows.reshape((len(rows), -1, count))
 
 
 def _has_light(cached: CachedRows) -> bool:

@@ -1,7 +1,8 @@
 """The ray-traced method: rays past the meshes themselves. It has no gradient to geometry."""
 
 import functools
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -12,7 +13,9 @@ from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node, NodeStage, detached
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
-from warpshadow.pipeline.shading.method import LightInput, LitLobes, Method
+from warpshadow.pipeline.shading.light_input import LightInput
+from warpshadow.pipeline.shading.lobe_light import LitLobes, LobeVisibility
+from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.gloss.reflection import find_blocked_radiance
 from warpshadow.stages.gloss.traced_lobes import trace_lobes
 from warpshadow.stages.light.light_samples import cut_map, sample_map
@@ -26,7 +29,7 @@ from warpshadow.stages.shell.beams import FAR, check_within
 if TYPE_CHECKING:  # it is imported where bodies emit
     from warpshadow.stages.emitters.samples import PlacedSamples
 
-Meshes = list[wp.Mesh | None]  # mesh that blocks the light of each instance of receivers; None for no blocker
+Meshes = list[wp.Mesh | None]  # mesh that blocks light of each instance, the last of the rest; None for no blocker
 _RAYS_OF_CELL = 4
 """Least number of rays to a cell of free light, on average."""
 
@@ -38,8 +41,6 @@ class RayTraced(Method):
 
     every_sample_receives = True
     shares_lobes = True
-    sun_samples = 16
-    lobe_samples = 64  # each is blocked or not: with 32, reflected edges show as many edges
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
         super().__init__(merged_scene, HarmonicBasis(merged_scene.scene.visibility.order), basis, progress=progress)
@@ -50,7 +51,7 @@ class RayTraced(Method):
         return Node(
             f"shading{points.suffix}",
             self._shade_shared if self.shares_directions else self._shade,
-            self._trees_around(points) if self.shares_directions else self._meshes(points),
+            self.trees_around(points) if self.shares_directions else self._meshes(points),
             points.receivers_node,
             light,
             self.shell_of(light),
@@ -68,13 +69,13 @@ class RayTraced(Method):
 
     def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
         """Direct light of emitters on points, by rays to their samples. Differentiable: emission."""
-        return self.emitters.traced_light(
-            *self._rays_to_emitters(points, materials), f"light of emitters{points.suffix}"
-        )
+        name = f"light of emitters{points.suffix}"
+        return Node(name, self.emitters.traced_light, *self._rays_to_emitters(points, materials))
 
     def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, by rays to their samples."""
-        return self.emitters.traced_highlights(*self._rays_to_emitters(points, materials), roughness, cameras)
+        rays = self._rays_to_emitters(points, materials)
+        return Node("highlights", self.emitters.traced_highlights, *rays, roughness, cameras)
 
     def _rays_to_emitters(self, points: LitPoints, materials: Materials) -> tuple[Node, Node, Node, Node]:
         """Receivers, samples, their radiance, and the transmittance between."""
@@ -105,26 +106,10 @@ class RayTraced(Method):
             for span in samples.spans()
         ]
 
-    def lobe_transmittance(self, lobes: LitLobes, directions: Node) -> Node:
-        """Transmittance towards the samples of lobes: rays, each of its own."""
-        points = lobes.points
-        item_text = functools.partial(receiver_text, points.weak)
-        return Node(
-            "transmittance of lobes",
-            _trace_lobes,
-            self._trees_around(points),
-            points.receivers_node,
-            directions,
-            items=item_text,
-        )
-
-    def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
-        """Mean radiance of the blockers of receivers, by their light with bounces and without."""
-        points = lobes.points
-        direct, trees = self.direct_shading(lobes.all_points, lobes.light), self._trees_around(points)
-        if openness is None:
-            openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
-        return Node("light of blockers", find_blocked_radiance, diffuse, lobes.select(direct), openness)
+    @functools.cached_property
+    def lobes(self) -> "TracedLobes":
+        """Visibility in lobes, by rays."""
+        return TracedLobes(self)
 
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
@@ -141,7 +126,7 @@ class RayTraced(Method):
             node.function = _refuse
         return node
 
-    def _trees_around(self, points: LitPoints) -> Node:
+    def trees_around(self, points: LitPoints) -> Node:
         """Node of the trees of all vertices around points."""
         name, vertices = "visibility" if self.shares_directions else "", points.vertices
         items = f"{len(self.merged_scene.body_of_face):,} faces"
@@ -177,35 +162,30 @@ class RayTraced(Method):
         return max(1, self.visibility.ray_count // self.merged_scene.scene.supersampling**2)
 
     def _casting_meshes(self, positions: wp.array, receivers: Receivers) -> Meshes:
-        points = receivers.points
-        count = min(len(points) if points.size else 0, len(positions))
-        meshes = [self.merged_scene.casting_mesh(positions[instance]) for instance in range(count)]
-        return [*meshes, *meshes[-1:] * (len(points) - count)]
+        count = min(len(receivers.points) if receivers.points.size else 0, len(positions))
+        return [self.merged_scene.casting_mesh(positions[instance]) for instance in range(count)]
 
     def _shade(
         self, meshes: Meshes, receivers: Receivers, light: KnownLight, shell: wp.array | None = None
     ) -> wp.array:
-        points, normals, shells = _checked_points(receivers.points), receivers.normals, _shells(receivers, shell)
+        points, shells = _checked_points(receivers.points), _shells(receivers, shell)
         samples = sample_map(light.radiance, self._sample_count)
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
-        for instance, mesh in enumerate(meshes):
-            lit_points, own_shell = (points[instance], normals[instance]), shells[min(instance, len(shells) - 1)]
-            lit = trace_shading(mesh, *lit_points, samples, shell=own_shell, progress=self.progress)
-            wp.copy(traced[instance], lit)
+        batches = traced, meshes, points, receivers.normals, shells
+        for result, mesh, origins, normals, own_shell in _instances(*batches):
+            wp.copy(result, trace_shading(mesh, origins, normals, samples, shell=own_shell, progress=self.progress))
         return traced
 
     def _shade_shared(
         self, trees: list[FaceTree], receivers: Receivers, light: KnownLight, shell: wp.array | None = None
     ) -> wp.array:
         """Shading by rays in directions that all receivers share, or to points of a shell."""
-        points, normals, progress = _checked_points(receivers.points), receivers.normals, self.progress
-        shells = _shells(receivers, shell)
+        points, shells = _checked_points(receivers.points), _shells(receivers, shell)
         count = -(-self.visibility.ray_count // PACKET) * PACKET
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
-        for instance in range(len(points) if points.size else 0):
-            tree = trees[min(instance, len(trees) - 1)]
-            lit_points = tree, points[instance], normals[instance]
-            options = {"shell": shells[min(instance, len(shells) - 1)]}
+        batches = traced, trees, points, receivers.normals, shells
+        for instance, (result, tree, origins, normals, own_shell) in enumerate(_instances(*batches)):
+            lit_points, options = (tree, origins, normals), {"shell": own_shell}
             # a ratio image has the same directions with the bodies and without
             pilots = (
                 None if self.merged_scene.scene.catchers else functools.partial(find_shares, *lit_points, **options)
@@ -214,48 +194,71 @@ class RayTraced(Method):
             corners = None
             if receivers.fragments.face_ids.ndim == 3:  # of an image
                 corners = find_corners(receivers, instance, self.merged_scene.scene.supersampling)
-            wp.copy(traced[instance], trace_shared(*lit_points, samples, corners=corners, progress=progress, **options))
+            wp.copy(result, trace_shared(*lit_points, samples, corners=corners, progress=self.progress, **options))
         return traced
 
     def _transfer(self, meshes: Meshes, receivers: Receivers, shell: wp.array | None = None) -> list[wp.array]:
-        points, normals, shells = receivers.points, receivers.normals, _shells(receivers, shell)
+        points, shells = receivers.points, _shells(receivers, shell)
         transfer = wp.empty((*points.shape, self.basis.size), dtype=wp.float32, device=points.device)
         functions, count = self.basis.functions, self.visibility.ray_count
         if isinstance(self.basis, CellBasis):
             functions, count = self.basis.balanced_functions, max(count, _RAYS_OF_CELL * self.basis.size)
-        for instance, mesh in enumerate(meshes):
-            traced = trace_transfer(
-                mesh,
-                points[instance],
-                normals[instance],
-                functions,
-                count,
-                shell=shells[min(instance, len(shells) - 1)],
-                progress=self.progress,
-            )
-            wp.copy(transfer[instance], traced)
+        batches = transfer, meshes, points, receivers.normals, shells
+        for result, mesh, origins, normals, own_shell in _instances(*batches):
+            options = {"shell": own_shell, "progress": self.progress}
+            wp.copy(result, trace_transfer(mesh, origins, normals, functions, count, **options))
         return [transfer]
 
 
+class TracedLobes(LobeVisibility):
+    """Visibility in lobes by rays, each of its own."""
+
+    sample_count = 64  # each is blocked or not: with 32, reflected edges show as many edges
+    sun_sample_count = 16
+
+    def __init__(self, method: RayTraced):
+        super().__init__(method.merged_scene, method.light, shares_receivers=method.shares_lobes)
+        self._method = method
+
+    def transmittance(self, lobes: LitLobes, directions: Node) -> Node:
+        """Transmittance towards the samples of lobes."""
+        points = lobes.points
+        arguments = self._method.trees_around(points), points.receivers_node, directions
+        item_text = functools.partial(receiver_text, points.weak)
+        return Node("transmittance of lobes", _trace_lobes, *arguments, items=item_text)
+
+    def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
+        """Mean radiance of the blockers of receivers, by their light with bounces and without."""
+        points = lobes.points
+        direct = self._method.direct_shading(lobes.all_points, lobes.light)
+        trees = self._method.trees_around(points)
+        if openness is None:
+            openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
+        return Node("light of blockers", find_blocked_radiance, diffuse, lobes.select(direct), openness)
+
+
 def _trace_lobes(trees: list[FaceTree], receivers: Receivers, directions: wp.array) -> wp.array:
-    points, normals, count = _checked_points(receivers.points), receivers.normals, len(directions)
+    points = _checked_points(receivers.points)
     traced = wp.empty(directions.shape, dtype=wp.float32, device=points.device)
-    for instance in range(count if points.size else 0):
-        point_batch = min(instance, len(points) - 1)
-        arguments = points[point_batch], normals[point_batch], directions[instance]
-        wp.copy(traced[instance], trace_lobes(trees[min(instance, len(trees) - 1)], *arguments))
+    for result, *arguments in _instances(traced, trees, points, receivers.normals, directions):
+        wp.copy(result, trace_lobes(*arguments))
     return traced
 
 
 def _openness(trees: list[FaceTree], receivers: Receivers) -> wp.array:
     """Light under an even sky of 1, vec3 of shape [batch, receiver]."""
-    points, normals = _checked_points(receivers.points), receivers.normals
-    result = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
+    points = _checked_points(receivers.points)
+    openness = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
     samples = cut_map(np.ones((64, 128, 3), np.float32), _EVEN_RAYS)
-    for instance in range(len(points) if points.size else 0):
-        arguments = trees[min(instance, len(trees) - 1)], points[instance], normals[instance], samples
-        wp.copy(result[instance], trace_shared(*arguments))
-    return result
+    for result, tree, origins, normals in _instances(openness, trees, points, receivers.normals):
+        wp.copy(result, trace_shared(tree, origins, normals, samples))
+    return openness
+
+
+def _instances(results: wp.array, *batches: Sequence[Any] | wp.array | np.ndarray) -> Iterator[tuple[Any, ...]]:
+    """Results of each instance, unless empty, with its part of each batch, of which the last serves the rest."""
+    for instance in range(len(results) if results.size else 0):
+        yield results[instance], *(batch[min(instance, len(batch) - 1)] for batch in batches)
 
 
 def _checked_points(points: wp.array) -> wp.array:

@@ -83,9 +83,9 @@ def find_share_of_sharpest_light(
         coverages.append(group.convex_parts_around.coverage(points, normals, directions, edge_radius))
     planes = group.planes
     if planes is not None and group.is_blocked_by_planes:
-        fronts, lifted = group.fronts_of_planes
-        options: dict[str, Any] = {"radius": edge_radius, "horizon_normals": normals, "fronts": fronts}
-        coverages.append(plane_coverage(lifted, planes.frames, planes.planes, directions, skip=planes.skip, **options))
+        front_weights, points = group.fronts_of_planes
+        options: dict[str, Any] = {"radius": edge_radius, "horizon_normals": normals, "front_weights": front_weights}
+        coverages.append(plane_coverage(points, planes.frames, planes.planes, directions, skip=planes.skip, **options))
     if coverages:
         transmittance = transmittance_past(transmittance, *coverages)
     lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]

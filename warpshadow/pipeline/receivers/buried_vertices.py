@@ -32,15 +32,20 @@ def find_bodies_with_buried_vertices(
         Bool of shape [body], of these bodies.
     """
     result, faces = np.zeros(len(bodies), bool), merged_scene.faces.numpy()
-    seen = np.unique(np.concatenate([*face_ids, np.empty(0, int)])).astype(int)
+    visible_faces = np.unique(np.concatenate([*face_ids, np.empty(0, int)])).astype(int)
     margin = _ROUNDING * np.abs(positions).max(initial=0.0)
-    runs = [slice(*merged_scene.first_vertex[number : number + 2]) for number in merged_scene.casting]
-    bounds = [(positions[run].min(axis=0) - margin, positions[run].max(axis=0) + margin) for run in runs]
+    starts = merged_scene.first_vertex
+    of_bodies = [positions[starts[number] : starts[number + 1]] for number in merged_scene.casting]
+    bounds = [(vertices.min(axis=0) - margin, vertices.max(axis=0) + margin) for vertices in of_bodies]
     mesh = normals = None
     for number, body in enumerate(bodies):
-        corners = faces[seen[merged_scene.body_of_face[seen] == body]]
-        planes = [run for run, casting in zip(runs, merged_scene.casting, strict=True) if merged_scene.is_flat[casting]]
-        if any(_cross(positions[corners], positions[run], margin) for run in planes):
+        corners = faces[visible_faces[merged_scene.body_of_face[visible_faces] == body]]
+        planes = [
+            vertices
+            for vertices, casting in zip(of_bodies, merged_scene.casting, strict=True)
+            if merged_scene.is_flat[casting]
+        ]
+        if any(_cross(positions[corners], points, margin) for points in planes):
             result[number] = True
             continue
         vertices = np.unique(corners)
@@ -51,9 +56,9 @@ def find_bodies_with_buried_vertices(
         candidates = vertices[is_within]
         if len(candidates):
             if mesh is None or normals is None:
-                placed = wp.array(positions, dtype=wp.vec3, device=merged_scene.device)
-                mesh = merged_scene.casting_mesh(placed)
-                normals = vertex_normals(placed.reshape((1, -1)), merged_scene.faces).numpy()[0]
+                on_device = wp.array(positions, dtype=wp.vec3, device=merged_scene.device)
+                mesh = merged_scene.casting_mesh(on_device)
+                normals = vertex_normals(on_device.reshape((1, -1)), merged_scene.faces).numpy()[0]
             is_buried = np.zeros(len(positions), bool)
             is_buried[candidates] = find_buried(mesh, positions[candidates], normals[candidates])
             result[number] = (is_buried[corners].any(axis=1) & ~is_buried[corners].all(axis=1)).any()

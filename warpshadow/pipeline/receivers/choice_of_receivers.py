@@ -138,22 +138,22 @@ def choose_receivers(
     is_seen_large = np.array([size.area > SMALL_FACE for size in sizes])
     # where the shadows of emitters and of light from a shell have edges, probes do not tell
     is_near = merged_scene.is_emitter.any() or merged_scene.scene.shell is not None
-    where_edges_are = "pixel" if is_near else "adaptive"
-    chosen = np.where(merged_scene.is_flat & is_sharp & is_seen_large, where_edges_are, chosen)
-    is_open = (chosen == "vertex") & (np.array(requested) == AUTO) & (~merged_scene.is_flat | is_sharp)
+    choice_at_edges = "pixel" if is_near else "adaptive"
+    chosen = np.where(merged_scene.is_flat & is_sharp & is_seen_large, choice_at_edges, chosen)
+    is_undecided = (chosen == "vertex") & (np.array(requested) == AUTO) & (~merged_scene.is_flat | is_sharp)
     unevenness, shows_buried = np.zeros(len(chosen)), np.zeros(len(chosen), bool)
     max_unevenness = UNEVEN * np.array([min(1.0, UNEVEN_SHARE * largest / (size.area or 1.0)) ** 0.5 for size in sizes])
-    if is_open.any() and merged_scene.scene.visibility.method != "none":
+    if is_undecided.any() and merged_scene.scene.visibility.method != "none":
         faces = [np.unique(face_ids[face_ids >= 0], return_counts=True) for face_ids, _ in images]
-        seen = [(camera, *counted) for camera, counted in zip(cameras, faces, strict=True)]
+        shown_faces = [(camera, *counted) for camera, counted in zip(cameras, faces, strict=True)]
         light = EnvironmentMap.constant() if is_light_free else merged_scene.scene.known_light
-        bodies = np.flatnonzero(is_open).tolist()
-        unevenness[is_open] = light_unevenness(merged_scene, positions, seen, bodies, light, near_light)
-        even_bodies = np.flatnonzero(is_open & (unevenness <= max_unevenness)).tolist()
-        seen_faces = [seen for seen, _ in faces]
-        shows_buried[even_bodies] = find_bodies_with_buried_vertices(merged_scene, positions, seen_faces, even_bodies)
+        bodies = np.flatnonzero(is_undecided).tolist()
+        unevenness[is_undecided] = light_unevenness(merged_scene, positions, shown_faces, bodies, light, near_light)
+        even_bodies = np.flatnonzero(is_undecided & (unevenness <= max_unevenness)).tolist()
+        face_ids = [ids for ids, _ in faces]
+        shows_buried[even_bodies] = find_bodies_with_buried_vertices(merged_scene, positions, face_ids, even_bodies)
     chosen = np.where(
-        shows_buried | (unevenness > max_unevenness), np.where(merged_scene.is_flat, where_edges_are, "pixel"), chosen
+        shows_buried | (unevenness > max_unevenness), np.where(merged_scene.is_flat, choice_at_edges, "pixel"), chosen
     )
     return [
         ReceiverChoice(choice if receivers == AUTO else receivers, size, float(error), float(limit), bool(buried))

@@ -21,7 +21,7 @@ from warpshadow.pipeline.receivers.lit_points import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.stages.convex.convex_blockers import PlacedParts
 from warpshadow.stages.light.cached_cells import CachedRows
-from warpshadow.stages.planes.fronts import Fronts, NearestBlockers, find_body_sides, find_fronts
+from warpshadow.stages.planes.fronts import NearestBlockers, PlaneFronts, find_body_sides, find_fronts
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.receivers.sample_receivers import Span
@@ -126,12 +126,12 @@ class Group:
         return self.own.lookup.transmittance(self.normals, self.own.probe_weights)
 
     @functools.cached_property
-    def fronts_of_planes(self) -> Fronts:
+    def fronts_of_planes(self) -> PlaneFronts:
         """As :meth:`find_fronts`, of the planes around the group."""
         assert self.planes is not None
         return self.find_fronts(self.planes.frames, self.planes.planes, self.planes.skip)
 
-    def find_fronts(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> Fronts:
+    def find_fronts(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> PlaneFronts:
         """Which part of each plane's front the receivers see, and the receivers lifted off planes they lie in."""
         extents = None if self.own is None else self.own.extents
         sides = None if extents is None else extents.sides_of(frames, planes)
@@ -243,7 +243,7 @@ class Blockers(NamedTuple):
     def planes_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupPlanes | None:
         """Flat bodies around receivers of one body: all that block, or some."""
         planes = self.blocker_kinds.planes
-        chosen, skip = _blocking(planes, body, of_bodies)
+        chosen, skip = _choose_blocking(planes, body, of_bodies)
         if self.frames is None or not chosen:
             return None
         return GroupPlanes(self.planes.blockers(planes, chosen), self.frames, skip)
@@ -251,7 +251,7 @@ class Blockers(NamedTuple):
     def convex_parts_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupConvexParts | None:
         """Convex parts of bodies around receivers of one body: all that block, or some."""
         bodies = self.blocker_kinds.convex
-        chosen, skip = _blocking(bodies, body, of_bodies)
+        chosen, skip = _choose_blocking(bodies, body, of_bodies)
         if self.placed_parts is None or not chosen:
             return None
         return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed_parts, skip)
@@ -269,7 +269,7 @@ class Blockers(NamedTuple):
         return Group(points, normals, *self.spheres_of(self.bodies), planes=planes, convex_parts_around=parts)
 
 
-def _blocking(
+def _choose_blocking(
     bodies: tuple[int, ...], body: int, of_bodies: Iterable[int] | None
 ) -> tuple[tuple[int, ...], int | None]:
     """Bodies of one kind that block light around a body, () if none but itself does; and which of them it is itself."""

@@ -85,7 +85,7 @@ def find_highlights(
         clip_matrices: Cameras, mat44 of shape [batch].
     Differentiable: as that, and roughness and clip_matrices.
     """
-    lobe_sums, first = [], 0
+    sums, first = [], 0
     for portion in (portion for group in groups for portion in group.portions()):
         end = first + portion.points.shape[1]
         seen = portion.points, portion.normals, cut(roughness, first, end), clip_matrices
@@ -94,9 +94,9 @@ def find_highlights(
             sum_highlights(*seen, placed_samples, radiance, *pair)
             for pair in _find_transmittances(emitters, self_visibility, portion, blockers, placed_samples)
         ]
-        lobe_sums.append([add_light(zeros, *parts) for parts in zip(*of_emitters, strict=True)] or [zeros, zeros])
+        sums.append([add_light(zeros, *parts) for parts in zip(*of_emitters, strict=True)] or [zeros, zeros])
         first = end
-    return LobeLight(*(join_portions(list(portions)) for portions in zip(*lobe_sums, strict=True)))
+    return LobeLight(*(join_portions(list(portions)) for portions in zip(*sums, strict=True)))
 
 
 def _find_transmittances(
@@ -231,7 +231,7 @@ def _log_of_planes(
     if planes is None or not group.is_blocked_by_planes:
         return None
     assert blockers.extents is not None
-    points, sides = group.fronts_of_planes.lifted, blockers.extents.sides_of(planes.frames, planes.planes)
+    points, sides = group.fronts_of_planes.lifted_points, blockers.extents.sides_of(planes.frames, planes.planes)
     skipped = -1 if planes.skip is None else planes.skip, numbers.index(body) if body in numbers else -1
     return find_log_transmittance_of_planes(
         points, group.normals, placed_samples, span, planes.frames, planes.planes, sides, body, skipped

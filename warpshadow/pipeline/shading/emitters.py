@@ -20,7 +20,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
-from warpshadow.pipeline.node import Call, Clock, Input, Node
+from warpshadow.pipeline.node import Call, Clock, Node
 from warpshadow.pipeline.receivers.lit_points import LitPoints
 from warpshadow.stages.bounces.albedo import mean_over_texels
 from warpshadow.stages.emitters.beams import find_axis_weights, weigh_by_beam
@@ -86,45 +86,39 @@ class SceneEmitters:
         """Weights of all vertices of the scene, given those of each emitter's, [row, vertex]."""
         from scipy.sparse import block_diag, csr_matrix
 
-        scene, matrix = self._merged_scene, block_diag(weights, format="csr")
-        vertices = np.flatnonzero(scene.is_emitter[scene.body_of_vertex])
-        shape = matrix.shape[0], int(scene.first_vertex[-1])
+        merged_scene, matrix = self._merged_scene, block_diag(weights, format="csr")
+        vertices = np.flatnonzero(merged_scene.is_emitter[merged_scene.body_of_vertex])
+        shape = matrix.shape[0], int(merged_scene.first_vertex[-1])
         matrix = csr_matrix((matrix.data, vertices[matrix.indices], matrix.indptr), shape)
-        return SparseMatrix.from_matrix(matrix, device=scene.device)
+        return SparseMatrix.from_matrix(matrix, device=merged_scene.device)
 
     def _find_beams(self) -> EmitterBeams | None:
         """Beams of the emitters; None where none has one."""
         from scipy.sparse import block_diag
 
-        scene = self._merged_scene
-        if not scene.has_beams:
+        merged_scene = self._merged_scene
+        if not merged_scene.has_beams:
             return None
-        bodies = [body for body in scene.scene.bodies if body.is_emitter]
+        bodies = [body for body in merged_scene.scene.bodies if body.is_emitter]
         weights = [find_axis_weights(body.mesh.positions, body.mesh.surface.faces) for body in bodies]
         of_vertices, of_faces = ([row[None] for row in rows] for rows in zip(*weights, strict=True))
-        of_emitting_faces = SparseMatrix.from_matrix(block_diag(of_faces, format="csr"), device=scene.device)
-        return EmitterBeams(scene.emitter_beams, self._over_all_vertices(of_vertices), of_emitting_faces)
+        of_emitting_faces = SparseMatrix.from_matrix(block_diag(of_faces, format="csr"), device=merged_scene.device)
+        return EmitterBeams(merged_scene.emitter_beams, self._over_all_vertices(of_vertices), of_emitting_faces)
 
     def emission_towards_cameras(
-        self, emission: Node, fragments: Node, vertices: Input, cameras: Input, placed_samples: Node
-    ) -> Node:
-        """Node of the emission that samples of an image show, given all of it, vec3 of shape [batch, height, width]."""
-        merged_scene = self._merged_scene
-
-        def show(
-            emission: wp.array,
-            fragments: Fragments,
-            vertices: wp.array,
-            cameras: wp.array,
-            placed_samples: PlacedSamples,
-        ) -> wp.array:
-            beams = self.samples.beams
-            assert beams is not None
-            emitter_of_face = constant(merged_scene.emitter_of_face, wp.int32, merged_scene.device)
-            seen = fragments, merged_scene.faces, vertices, cameras
-            return show_beams(emission, *seen, placed_samples, emitter_of_face, beams.beams)
-
-        return Node("beams", show, emission, fragments, vertices, cameras, placed_samples)
+        self,
+        emission: wp.array,
+        fragments: Fragments,
+        vertices: wp.array,
+        cameras: wp.array,
+        placed_samples: PlacedSamples,
+    ) -> wp.array:
+        """Emission that samples of an image show, given all of it, vec3 of shape [batch, height, width]."""
+        merged_scene, beams = self._merged_scene, self.samples.beams
+        assert beams is not None
+        emitter_of_face = constant(merged_scene.emitter_of_face, wp.int32, merged_scene.device)
+        seen = fragments, merged_scene.faces, vertices, cameras
+        return show_beams(emission, *seen, placed_samples, emitter_of_face, beams.beams)
 
     @functools.cached_property
     def self_visibility(self) -> list[EmitterSelfVisibility | None]:
@@ -149,28 +143,27 @@ class SceneEmitters:
         """Luminance of their light past the scene's meshes, a :data:`.NearLight`."""
         from warpshadow.stages.emitters.traced_transmittance import trace_transmittance
 
-        scene, samples = self._merged_scene, self.samples
-        at_points, along_normals = (
-            wp.array(item[None], dtype=wp.vec3, device=scene.device) for item in (points, normals)
+        merged_scene, samples = self._merged_scene, self.samples
+        point_array, normal_array = (
+            wp.array(item[None], dtype=wp.vec3, device=merged_scene.device) for item in (points, normals)
         )
         placed_samples = place_samples(vertices.reshape((1, -1)), samples)
-        radiance = self.radiance(Materials.of_scene(scene)).value(Call(Clock()))
+        radiance = self.radiance(Materials.of_scene(merged_scene)).value(Call(Clock()))
         total = np.zeros(len(points))
         for span in samples.spans():
-            at_samples = samples, vertices, placed_samples.points[0], placed_samples.areas[0], span
-            traced = trace_transmittance(mesh, at_points[0], along_normals[0], *at_samples, rays=1)
-            transmittance = weigh_by_beam(at_points, placed_samples, span, traced.reshape((1, *traced.shape)))
-            light = sum_light(at_points, along_normals, placed_samples, radiance, span, transmittance)
+            sample_arguments = samples, vertices, placed_samples.points[0], placed_samples.areas[0], span
+            traced = trace_transmittance(mesh, point_array[0], normal_array[0], *sample_arguments, rays=1)
+            transmittance = weigh_by_beam(point_array, placed_samples, span, traced.reshape((1, *traced.shape)))
+            light = sum_light(point_array, normal_array, placed_samples, radiance, span, transmittance)
             total += light.numpy()[0] @ LUMINANCE
         return total
 
     def samples_node(self, points: LitPoints) -> Node:
         """Node of the samples among the bodies around points."""
+        return points.cached_of_bodies("emitters", None, lambda: Node("", self._place, points.vertices))
 
-        def place(vertices: wp.array) -> PlacedSamples:
-            return place_samples(vertices, self.samples)
-
-        return points.cached_of_bodies("emitters", None, lambda: Node("", place, points.vertices))
+    def _place(self, vertices: wp.array) -> PlacedSamples:
+        return place_samples(vertices, self.samples)
 
     def radiance(self, materials: Materials) -> Node:
         """Node of the samples' radiance, vec3 of shape [batch, sample]."""
@@ -205,44 +198,27 @@ class SceneEmitters:
         return self._texel_matrices[number, size]
 
     def traced_light(
-        self, receivers: Node, placed_samples: Node, radiance: Node, transmittance: Node, name: str
-    ) -> Node:
-        """Node of their light on receivers, given the transmittance to the samples of each, a list."""
-
-        def light(
-            receivers: Receivers, placed_samples: PlacedSamples, radiance: wp.array, transmittance: list[wp.array]
-        ) -> wp.array:
-            lit = receivers.points, receivers.normals, placed_samples, radiance
-            pairs = self._within_beams(receivers, placed_samples, transmittance)
-            return add_light(*(sum_light(*lit, *pair) for pair in pairs))
-
-        return Node(name, light, receivers, placed_samples, radiance, transmittance)
+        self, receivers: Receivers, placed_samples: PlacedSamples, radiance: wp.array, transmittance: list[wp.array]
+    ) -> wp.array:
+        """Their light on receivers, given the transmittance to the samples of each."""
+        lit = receivers.points, receivers.normals, placed_samples, radiance
+        pairs = self._within_beams(receivers, placed_samples, transmittance)
+        return add_light(*(sum_light(*lit, *pair) for pair in pairs))
 
     def traced_highlights(
         self,
-        receivers: Node,
-        placed_samples: Node,
-        radiance: Node,
-        transmittance: Node,
-        roughness: Node,
-        cameras: Input,
-    ) -> Node:
-        """Node of their light in the lobes of receivers, G and G', given transmittance as for :meth:`traced_light`."""
-
-        def highlights(
-            receivers: Receivers,
-            placed_samples: PlacedSamples,
-            radiance: wp.array,
-            transmittance: list[wp.array],
-            roughness: wp.array,
-            clip_matrices: wp.array,
-        ) -> LobeLight:
-            seen = receivers.points, receivers.normals, roughness, clip_matrices, placed_samples, radiance
-            pairs = self._within_beams(receivers, placed_samples, transmittance)
-            of_emitters = [sum_highlights(*seen, *pair) for pair in pairs]
-            return LobeLight(*(add_light(*parts) for parts in zip(*of_emitters, strict=True)))
-
-        return Node("highlights", highlights, receivers, placed_samples, radiance, transmittance, roughness, cameras)
+        receivers: Receivers,
+        placed_samples: PlacedSamples,
+        radiance: wp.array,
+        transmittance: list[wp.array],
+        roughness: wp.array,
+        clip_matrices: wp.array,
+    ) -> LobeLight:
+        """Their light in the lobes of receivers, G and G', given transmittance as for :meth:`traced_light`."""
+        seen = receivers.points, receivers.normals, roughness, clip_matrices, placed_samples, radiance
+        pairs = self._within_beams(receivers, placed_samples, transmittance)
+        of_emitters = [sum_highlights(*seen, *pair) for pair in pairs]
+        return LobeLight(*(add_light(*parts) for parts in zip(*of_emitters, strict=True)))
 
     def _within_beams(
         self, receivers: Receivers, placed_samples: PlacedSamples, transmittance: list[wp.array]

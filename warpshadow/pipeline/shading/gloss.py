@@ -18,14 +18,16 @@ from warpshadow.device.constants import constant
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node, detached, field_of
 from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
-from warpshadow.pipeline.shading.method import LightInput, LitLobes, Method
+from warpshadow.pipeline.shading.light_input import LightInput
+from warpshadow.pipeline.shading.lobe_light import LitLobes
+from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.shading.transfers import change_basis
 from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.stages.gloss.lobes import LobeSamples, sample_lobes
 from warpshadow.stages.gloss.normal_spread import NormalSpread, find_normal_spread
 from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
 from warpshadow.stages.gloss.reflection import LobeLight, mix_reflection, number_runs, sum_lobes
-from warpshadow.stages.gloss.suns import Suns, add_suns
+from warpshadow.stages.gloss.suns import add_suns
 from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.rasterization import Fragments
@@ -65,66 +67,56 @@ class GlossyPoints(LitPoints):
         )
         self._numbers = Node("", functools.partial(_number_glossy, glossy), detached(view.receivers_node))
 
-    def mix(
-        self,
-        view: LitPoints,
-        diffuse: Node,
-        light: LightInput,
-        materials: Materials,
-        bounced: Node,
-        openness: Node | None,
-    ) -> tuple[Node, Node]:
+    def lit(self, light: LightInput, view: LitPoints) -> LitLobes:
+        """The points in some light, among the receivers of the view or its preview."""
+        return LitLobes(self, light, view, self.select)
+
+    def mix(self, lobes: LitLobes, diffuse: Node, materials: Materials, blocked: Node | None) -> tuple[Node, Node]:
         """Mix mirrored light with diffuse light, of all receivers of the view.
 
         Returns:
             Nodes of the light that colored and that white surfaces reflect, vec3 of shape [batch, receiver].
 
         Args:
-            view: The view, or its preview.
+            lobes: The points in their light, from :meth:`lit`.
             diffuse: Node of the view's shading.
-            light: As for :meth:`.LightTransport.shading`.
             materials: Of the bodies.
-            bounced: Node of the view's shading without direct light of emitters.
-            openness: Of the view, as of :meth:`.LightTransport.openness`.
+            blocked: As of :meth:`.LightTransport.blocked_radiance`.
         """
-        item_text = functools.partial(receiver_text, self.weak)
+        item_text, visibility = functools.partial(receiver_text, self.weak), self.method.lobes
         values = {name: self._find_values(materials, name) for name in GLOSS_ARGUMENTS}
-        roughness = values["roughness"]
-        key = materials.roughness
+        roughness, light = values["roughness"], lobes.light
 
-        def lobes() -> Node:
+        def sample() -> Node:
             spread = Node(
                 "", self._find_normal_spread, self.receivers_node, self.normals, self._clip_positions, self._fragments
             )
             inputs = self.receivers_node, roughness, self._cameras, spread, self._fragments
             return Node("lobes", self._sample_lobes, *inputs, items=item_text)
 
-        sampled = self.cached("lobes", key, lobes)
-        directions, filters = field_of(sampled, "directions"), field_of(sampled, "filters")
-        texels = self.cached("prefiltered", light, lambda: self._prefilter(light))
+        samples = self.cached("lobes", materials.roughness, sample)
+        directions, filters = field_of(samples, "directions"), field_of(samples, "filters")
+        texels = self._prefiltered(light)
         shell, exits = self.method.shell_of(light), directions
         if shell is not None:
-            exits = Node("", _find_exits, self.receivers_node, directions, shell)
+            exits = Node("", exits_from_shell, field_of(self.receivers_node, "points"), directions, shell)
         radiance = Node("prefiltered light", look_up_light, texels, exits, filters, items=item_text)
-        lit_lobes = LitLobes(self, light, view, self.select)
-        transmittance = self.method.lobe_transmittance(lit_lobes, directions)
-        blocked = None
-        if self.merged_scene.scene.bounces:
-            own_openness = None if openness is None else self.select(openness)
-            blocked = self.method.blocked_radiance(lit_lobes, self.select(bounced), own_openness)
-        sums = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, items=item_text)
-        suns = self.method.suns(light)
+        transmittance = visibility.transmittance(lobes, directions)
+        lobe_light = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, items=item_text)
+        suns = visibility.suns(self, light)
         if suns is not None:
-            past_blockers = self.method.sun_transmittance(lit_lobes, suns)
-            sums = Node("suns", _add_suns, sums, sampled, suns, past_blockers, items=item_text)
+            sun_transmittance = visibility.sun_transmittance(lobes, suns)
+            inputs = lobe_light, field_of(samples, "lobes"), suns, sun_transmittance
+            lobe_light = Node("suns", add_suns, *inputs, items=item_text)
         if materials.emission:
-            sums = Node("", _add_highlights, sums, self.method.highlights(self, materials, roughness, self._cameras))
-        lobe_light = field_of(sums, "straight"), field_of(sums, "grazing")
+            highlights = self.method.highlights(self, materials, roughness, self._cameras)
+            lobe_light = Node("", _add_highlights, lobe_light, highlights)
         arguments = (
             self._numbers,
             diffuse,
-            *lobe_light,
-            field_of(sampled, "cosines"),
+            field_of(lobe_light, "straight"),
+            field_of(lobe_light, "grazing"),
+            field_of(samples, "cosines"),
             values["metallic"],
             values["specular"],
         )
@@ -161,7 +153,8 @@ class GlossyPoints(LitPoints):
         self, receivers: Receivers, normals: wp.array, clip_positions: wp.array, seen: Fragments
     ) -> NormalSpread:
         """Find how normals vary over the receivers. Differentiable: all but seen."""
-        sharing = self.merged_scene.scene.supersampling // self.method.lobes_across  # samples of a receiver, across
+        # samples of a receiver, across
+        sharing = self.merged_scene.scene.supersampling // self.method.lobes.receivers_across
         _, height, width = seen.face_ids.shape
         fragments, size = receivers.sample_fragments, (width // sharing, height // sharing)
         assert fragments is not None
@@ -171,11 +164,11 @@ class GlossyPoints(LitPoints):
         self, receivers: Receivers, roughness: wp.array, cameras: wp.array, spread: NormalSpread, seen: Fragments
     ) -> LobeSamples:
         """Samples of the lobes of the receivers. Differentiable: all but seen."""
-        places, lobes_across = None, self.method.lobes_across
-        if lobes_across > 1 and receivers.samples is not None:
-            places = places_in_pixels(receivers.samples, seen.face_ids.shape[2], lobes_across)
-        arguments = receivers.points, receivers.normals, roughness, cameras, self.method.lobe_samples_of_receiver
-        return sample_lobes(*arguments, spread, places, lobes_across**2)
+        places, across = None, self.method.lobes.receivers_across
+        if across > 1 and receivers.samples is not None:
+            places = places_in_pixels(receivers.samples, seen.face_ids.shape[2], across)
+        arguments = receivers.points, receivers.normals, roughness, cameras, self.method.lobes.samples_of_receiver
+        return sample_lobes(*arguments, spread, places, across**2)
 
     def _sample_textures(
         self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints
@@ -183,13 +176,12 @@ class GlossyPoints(LitPoints):
         """Find numbers of the view's samples: of textures and, on bodies without one, of vertices."""
         return as_scalars(sample_albedo(fragments, self.merged_scene.faces, as_colors(values), textures, footprints))
 
-    def _prefilter(self, light: LightInput) -> Node:
+    def _prefiltered(self, light: LightInput) -> Node:
         """Node of prefiltered light, vec3 of shape [batch, texel]."""
-        if light.is_free:
-            return Node(
-                "prefiltering", self._prefilter_free, light, items=lambda: f"{self.method.basis.size} coefficients"
-            )
-        return self.method.prefiltered(light)
+        if not light.is_free:
+            return self.method.lobes.prefiltered(self, light)
+        find, items = self._prefilter_free, f"{self.method.basis.size} coefficients"
+        return self.cached("prefiltered", light, lambda: Node("prefiltering", find, light, items=items))
 
     def _prefilter_free(self, light: wp.array) -> wp.array:
         """Prefilter free light. Differentiable: light."""
@@ -204,16 +196,6 @@ def _prefilter_basis(basis: object) -> np.ndarray:
     directions = sh.equirectangular_directions(_CELL_ROWS)
     functions = basis.functions(directions.reshape(-1, 3))  # type: ignore[attr-defined]
     return prefilter(functions.reshape(_CELL_ROWS, 2 * _CELL_ROWS, -1))
-
-
-def _find_exits(receivers: Receivers, directions: wp.array, shell: wp.array) -> wp.array:
-    """Find directions from the center of a shell to where samples of lobes meet it. Differentiable: all."""
-    return exits_from_shell(receivers.points, directions, shell)
-
-
-def _add_suns(lobe_light: LobeLight, samples: LobeSamples, suns: Suns, transmittance: wp.array) -> LobeLight:
-    """Add the light of suns to other light in lobes. Differentiable: all but suns."""
-    return add_suns(lobe_light, samples.lobes, suns, transmittance)
 
 
 def _add_highlights(lobe_light: LobeLight, highlights: LobeLight) -> LobeLight:

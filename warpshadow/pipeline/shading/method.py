@@ -5,16 +5,14 @@ from __future__ import annotations
 import abc
 import functools
 from collections.abc import Callable, Hashable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
-from warpshadow.assets.known_light import KnownLight, as_light
+from warpshadow.assets.known_light import as_light
 from warpshadow.assets.light import EnvironmentMap
-from warpshadow.device.batch import expand
-from warpshadow.device.constants import constant
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
@@ -27,76 +25,22 @@ from warpshadow.pipeline.receivers.lit_points import (
     receiver_text,
 )
 from warpshadow.pipeline.receivers.static import StaticBodies
+from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.transfers import Light, check_light, shade_free
-from warpshadow.stages.gloss.prefilter import prefilter
-from warpshadow.stages.gloss.suns import Suns, directions_in_suns, separate_suns
-from warpshadow.stages.receivers.find import Numbering, Receivers, number_receivers
+from warpshadow.stages.receivers.find import Numbering, number_receivers
 from warpshadow.stages.receivers.quadtree import Quadtree
 from warpshadow.stages.shell.beams import check_shell, shell_array
 
-if TYPE_CHECKING:  # it is imported where a body emits
+if TYPE_CHECKING:  # they are imported where a body emits, or shines
     from warpshadow.pipeline.shading.emitters import SceneEmitters
-
-
-class LightInput(Input):
-    """Light as an input: known light, or free coefficients.
-
-    Args:
-        value: The light.
-        shell: Of the light, vec4 of shape [batch], where it is not the scene's; None where it is, or is infinitely far.
-        why_new: As for :class:`Input`.
-    """
-
-    def __init__(self, value: KnownLight | wp.array, shell: Input | None = None, *, why_new: str = ""):
-        super().__init__("light", value, why_new=why_new)
-        self.shell = shell
-
-    @property
-    def is_free(self) -> bool:
-        """Whether it is free light, an array, and not known light."""
-        return isinstance(self.value(), wp.array)
-
-    @functools.cached_property
-    def suns_and_rest(self) -> tuple[Suns, np.ndarray]:
-        """The suns of known light, and its map without them."""
-        return separate_suns(self.value().radiance)
-
-    @property
-    def visibility_key(self) -> Input | None:
-        """The input on which visibility depends besides points and blockers.
-
-        It depends on known light, since cells look to where that comes from. Of free light, whose cells are even, it
-        depends on the shell alone.
-        """
-        return self.shell if self.is_free else self
-
-
-class LitLobes(NamedTuple):
-    """Receivers on bodies that shine, and their light."""
-
-    points: LitPoints
-    light: LightInput  # known or free, which says where shadows have to be sharp
-    all_points: LitPoints  # the receivers of the image, among which they are
-    select: Callable[[Node], Node]  # of a node of light on all_points makes one of light on points
-
-
-def _repeat_directions(directions: np.ndarray, receivers: Receivers) -> wp.array:
-    """Repeat directions [1, direction, 3] for each receiver, vec3 of shape [1, receiver, direction]."""
-    count, device = receivers.points.shape[1], receivers.points.device
-    if not count:
-        return wp.empty((1, 0, directions.shape[1]), dtype=wp.vec3, device=device)
-    return expand(constant(directions, wp.vec3, device), count).reshape((1, count, -1))
-
-
-_MIN_LOBE_SAMPLES = 8  # of a receiver, however many receivers a pixel has: as many as a processor finds at once
+    from warpshadow.pipeline.shading.lobe_light import LobeVisibility
 
 
 class Method(abc.ABC):
     """How light is blocked: a method of visibility.
 
     A method gives these members. A method by spheres derives from :class:`.SphereMethod`, which gives all but
-    :meth:`lobe_transmittance`, :meth:`sun_transmittance`, :meth:`blocked_radiance` and :meth:`along_paths`, and has a
-    table of its own:
+    :attr:`lobes` and :meth:`along_paths`, and has a table of its own:
 
     | member | needed for | default |
     | --- | --- | --- |
@@ -104,14 +48,12 @@ class Method(abc.ABC):
     | :meth:`transfers` | free light | – |
     | :meth:`emitted_light` | lamps | – |
     | :meth:`highlights` | lamps, on bodies that shine | – |
-    | :meth:`lobe_transmittance` | bodies that shine | 1: no shadows |
-    | :meth:`sun_transmittance` | suns, on bodies that shine | :meth:`lobe_transmittance` in :attr:`sun_samples` |
-    | :meth:`blocked_radiance` | bodies that shine, where light bounces | refused |
+    | :attr:`lobes` | bodies that shine | no shadows in what they mirror |
     | :meth:`openness` | light that bounces between static patches | None: rays find it, as they find form factors |
     | :meth:`along_paths` | light that bounces along paths (:func:`.choose_bouncing`) | refused |
     | :meth:`blocker_kinds` | planes, convex parts, traced self-visibility | spheres alone |
     | :meth:`find_squares` | adaptive receivers | None, where every sample receives light |
-    | the six fields below | as they say | False; 32; 1 |
+    | the four fields below | as they say | False |
 
     A scene is refused whose bodies shine, or whose light bounces, where the method's row of ``METHOD_TRAITS``
     (:mod:`warpshadow.scene.visibility`) says no: the method then needs no member for that.
@@ -128,12 +70,6 @@ class Method(abc.ABC):
 
     shares_directions = False
     """Whether all receivers look for light in the same directions, so that one is enough for a surface in a pixel."""
-
-    lobe_samples = 32
-    """Samples of a lobe of a body that shines. Light without shadows, and without its suns, of an indoor map is
-    2.1% off with 32, 3.5% with 16 (roughness 0.35)."""
-
-    sun_samples = 1  # directions in which each sun is looked for from the lobe of a receiver
 
     shares_lobes = False
     """Whether samples of a pixel on one face of a body that shines share a receiver. Else each is one, with its part of
@@ -329,70 +265,12 @@ class Method(abc.ABC):
     def transfers(self, points: LitPoints, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, an array for each group, for light from a shell."""
 
-    def suns(self, light: LightInput) -> Suns | None:
-        """Suns of known light, infinitely far away, which prefiltered light is without; None where it has none."""
-        if light.is_free or self.shell_of(light) is not None or not len(light.suns_and_rest[0].directions):
-            return None
-        return light.suns_and_rest[0]
-
     @functools.cached_property
-    def _prefiltered_from_scene(self) -> Node:
-        return self._prefiltered(self.light)
+    def lobes(self) -> LobeVisibility:
+        """How light in the lobes of bodies that shine is blocked."""
+        from warpshadow.pipeline.shading.lobe_light import LobeVisibility
 
-    def prefiltered(self, light: LightInput) -> Node:
-        """Node of known light without its suns, prefiltered, vec3 [1, texel]; the scene's is cached."""
-        return self._prefiltered_from_scene if light is self.light else self._prefiltered(light)
-
-    def _prefiltered(self, light: LightInput) -> Node:
-        def find(known: KnownLight) -> wp.array:
-            radiance = known.radiance if self.suns(light) is None else light.suns_and_rest[1]
-            return constant(prefilter(radiance)[None], wp.vec3, self.merged_scene.device)
-
-        return Node("prefiltering", find, light)
-
-    @property
-    def lobes_across(self) -> int:
-        """How many receivers a pixel has across and down on a body that shines, if it sees one of its faces alone."""
-        return 1 if self.shares_lobes else self.merged_scene.scene.supersampling
-
-    @property
-    def lobe_samples_of_receiver(self) -> int:
-        """Number of samples of the lobe of a receiver."""
-        return max(self.lobe_samples // self.lobes_across**2, min(self.lobe_samples, _MIN_LOBE_SAMPLES))
-
-    def lobe_transmittance(self, lobes: LitLobes, directions: Node) -> Node:
-        """Transmittance towards the samples of lobes, float32 of shape [batch, receiver, sample].
-
-        Args:
-            lobes: The receivers.
-            directions: Node of the samples' directions, vec3 of shape [batch, receiver, sample].
-
-        Without shadows it is 1.
-        """
-        return Node("", lambda towards: wp.full(towards.shape, 1.0, wp.float32, device=towards.device), directions)
-
-    def sun_transmittance(self, lobes: LitLobes, suns: Suns) -> Node:
-        """Transmittance towards directions in suns, as many in each, float32 of shape [batch, receiver, direction].
-
-        Args:
-            lobes: The receivers.
-            suns: The suns of their light.
-
-        By default :meth:`lobe_transmittance` finds it, in :attr:`sun_samples` directions that are even over each sun.
-        """
-        directions = directions_in_suns(suns, self.sun_samples).reshape(1, -1, 3)
-        towards = Node("", functools.partial(_repeat_directions, directions), lobes.points.receivers_node)
-        return self.lobe_transmittance(lobes, towards)
-
-    def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
-        """Mean radiance of the blockers of receivers, where light bounces, vec3 of shape [batch, receiver].
-
-        Args:
-            lobes: The receivers.
-            diffuse: Node of their shading.
-            openness: Of them, as of :meth:`.LightTransport.openness`.
-        """
-        raise NotImplementedError
+        return LobeVisibility(self.merged_scene, self.light, shares_receivers=self.shares_lobes)
 
     def along_paths(self, direct: Node, points: LitPoints, light: LightInput, materials: Materials) -> Node:
         """Shading of points in known light that bounces along paths, added to direct light."""

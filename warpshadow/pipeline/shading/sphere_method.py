@@ -19,7 +19,8 @@ from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached
 from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_groups
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, VisibleSurfaces, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
-from warpshadow.pipeline.shading.method import LightInput, Method
+from warpshadow.pipeline.shading.light_input import LightInput
+from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis, join_portions
 from warpshadow.stages.light.shading import shade

@@ -46,8 +46,8 @@ def join_portions(portions: list[wp.array]) -> wp.array:
     return portions[0] if len(portions) == 1 else concatenate(portions, [portion.shape[1] for portion in portions])
 
 
-def join_transfers(portions: list[wp.array]) -> wp.array:
-    """Join the transfer vectors of all portions, float32 of shape [batch, receiver, coefficient]."""
+def join_rows(portions: list[wp.array]) -> wp.array:
+    """Join rows of the receivers of portions, such as transfer vectors, [batch, receiver, item]. Differentiable."""
     if len(portions) == 1:
         return portions[0]
     rows = join_portions([portion.reshape((portion.shape[0], -1)) for portion in portions])

@@ -54,11 +54,12 @@ class CatchersAlone:
             view: The view of the whole scene.
         """
         views, scene = self._views, self._merged_scene.scene
-        of_scene = {name: scene.per_body(inputs.of_bodies[name], name) for name in ("albedo", "textures")}
-        alone = views.find(inputs.geometry, inputs.clip_matrices)
-        of_catchers = {name: [items[number] for number in self._numbers] for name, items in of_scene.items()}
-        materials = alone.materials.replaced(of_catchers)
-        if alone.method.every_sample_receives:  # rays are drawn by a receiver's number: the same for both views
-            alone = alone.at_receivers_of(view)
-        light = alone.method.light_input(alone, inputs.light, inputs.shell)
-        return alone.white_samples(light, materials).value(views.call(alone))
+        scene_values = {name: scene.per_body(inputs.of_bodies[name], name) for name in ("albedo", "textures")}
+        catcher_view = views.view(inputs.geometry, inputs.clip_matrices)
+        catcher_values = {name: [items[number] for number in self._numbers] for name, items in scene_values.items()}
+        materials = catcher_view.materials.replaced(catcher_values)
+        if catcher_view.method.every_sample_receives:  # rays are drawn by a receiver's number: the same for both views
+            catcher_view = catcher_view.at_receivers_of(view)
+        # an input of their own: their method and view cache other nodes of the same light
+        light = catcher_view.method.light_input(catcher_view, inputs.light, inputs.shell)
+        return catcher_view.white_samples(light, materials).value(views.call(catcher_view))

@@ -1,7 +1,7 @@
 """Views of a scene: its geometries seen by cameras, which are used again while their inputs stay the same.
 
-Two views are kept: the last one of the scene itself, and the last of another geometry or by other cameras, once their
-receivers and silhouettes are found. Not kept are views to whose geometry or cameras a gradient is asked for, as they
+Two views are cached: the last one of the scene itself, and the last of another geometry or by other cameras, once their
+receivers and silhouettes are found. Not cached are views to whose geometry or cameras a gradient is asked for, as they
 never come again, and those of a graph that is captured, whose memory their values are.
 """
 
@@ -46,16 +46,18 @@ class SceneViews:
 
     def __init__(self, transport: LightTransport, materials: Materials, cameras: Sequence[Camera], clock: Clock):
         self._transport, self._method = transport, transport.method
-        self._materials, self._clock, self._merged_scene = materials, clock, self._method.merged_scene
-        scene = self._merged_scene
-        self.vertices = Input("vertices", lambda: scene.scene_geometry.positions)
-        self._spheres = Input("spheres", lambda: (scene.scene_geometry.centers, scene.scene_geometry.radii))
-        self._rotations = Input("rotations", lambda: scene.scene_geometry.rotations)
+        merged_scene = self._merged_scene = self._method.merged_scene
+        self._materials, self._clock = materials, clock
+        self.vertices = Input("vertices", lambda: merged_scene.scene_geometry.positions)
+        self._spheres = Input(
+            "spheres", lambda: (merged_scene.scene_geometry.centers, merged_scene.scene_geometry.radii)
+        )
+        self._rotations = Input("rotations", lambda: merged_scene.scene_geometry.rotations)
         self.has_warned = False
         self._static: dict[tuple[int, ...], StaticBodies] = {}  # by moving bodies
-        self._see_by(cameras)
+        self._set_cameras(cameras)
 
-    def _see_by(self, cameras: Sequence[Camera]) -> None:
+    def _set_cameras(self, cameras: Sequence[Camera]) -> None:
         matrices, device = [camera.clip_matrix() for camera in cameras], self._merged_scene.device
         self._cameras = tuple(cameras)
         self.clip_matrices = Input("cameras", lambda: wp.array(matrices, dtype=wp.mat44, device=device))
@@ -66,21 +68,21 @@ class SceneViews:
         """Views by other cameras of the same bodies, which draw no warning."""
         other = copy.copy(self)
         other.has_warned = True
-        other._see_by(cameras)
+        other._set_cameras(cameras)
         return other
 
     def call(self, points: LitPoints | None = None) -> Call:
         """A call, with the cached values of points."""
         return Call(self._clock, points.call if points else None, caches=not self._merged_scene.device.is_capturing)
 
-    def find(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
-        """The view of a geometry, with its receivers and silhouettes, which are found unless it is kept."""
-        view = self.view(geometry, clip_matrices)
+    def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
+        """The view of a geometry, with its receivers and silhouettes, which are found unless it is cached."""
+        view = self.lazy_view(geometry, clip_matrices)
         if view not in self.last:
             for node in (view.receivers_node, view.silhouettes):
                 node.value(view.call)
             self._warn_once(view)
-            self._keep(view)
+            self._cache_view(view)
         return view
 
     def _warn_once(self, view: View) -> None:
@@ -93,8 +95,8 @@ class SceneViews:
         """Whether a view is of the bodies where the scene has them, by its cameras."""
         return view.vertices is self.vertices and view.cameras is self.clip_matrices
 
-    def _keep(self, view: View) -> None:
-        """Keep a view whose receivers are found, unless it has gradients or belongs to a graph."""
+    def _cache_view(self, view: View) -> None:
+        """Cache a view whose receivers are found, unless it has gradients or belongs to a graph."""
         if self._merged_scene.device.is_capturing:
             return
         self._last_cameras = view.cameras
@@ -103,8 +105,8 @@ class SceneViews:
         if view.receivers_node.is_cached:
             self.last = (view, self.last[1]) if self._is_of_scene(view) else (self.last[0], view)
 
-    def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
-        """Build a lazy view, or reuse one that is kept if its inputs match."""
+    def lazy_view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
+        """Build a view of which nothing is computed yet, or reuse a cached one if its inputs match."""
         vertices, spheres, cameras, static_bodies = self.vertices, self._spheres, self.clip_matrices, None
         last, poses, matrices = self.last[1], [None], self._cameras
         if geometry is not None:
@@ -185,13 +187,13 @@ class SceneViews:
             geometry: Where the bodies are, by default where the scene has them.
         Differentiable: geometry.
         """
-        scene, blocker_kinds, bodies = self._merged_scene, self._blocker_kinds(geometry), self._bodies(geometry)
+        merged_scene, blocker_kinds, bodies = self._merged_scene, self._blocker_kinds(geometry), self._bodies(geometry)
         owners = self._method.separate_bodies(blocker_kinds)
         if owners is not None:
-            owners = owners[scene.body_of_face[sides % len(scene.body_of_face)]]
-        normals = Node("", vertex_normals, bodies[0], scene.faces)
-        node = Node("", receivers_on_faces, bodies[0], normals, scene.faces, sides, barycentrics, owners)
-        points = scene, self._materials, *bodies, node, self.call()
+            owners = owners[merged_scene.body_of_face[sides % len(merged_scene.body_of_face)]]
+        normals = Node("", vertex_normals, bodies[0], merged_scene.faces)
+        node = Node("", receivers_on_faces, bodies[0], normals, merged_scene.faces, sides, barycentrics, owners)
+        points = merged_scene, self._materials, *bodies, node, self.call()
         return LitPoints(*points, normals=normals, blocker_kinds=blocker_kinds)
 
 

@@ -10,7 +10,8 @@ from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.bodies.reflectance import Materials, SampleReflectance
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, field_of, identity
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
-from warpshadow.pipeline.shading.method import LightInput, Method
+from warpshadow.pipeline.shading.light_input import LightInput
+from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.receiver_finder import ReceiverFinder
 from warpshadow.stages.geometry.normals import vertex_normals
@@ -228,10 +229,8 @@ class View(LitPoints):
         """Node of the part of emission that goes towards the cameras; itself where no emitter has a beam."""
         if not self.merged_scene.has_beams:
             return emission
-        emitters = self.method.emitters
-        return emitters.emission_towards_cameras(
-            emission, self.fragments_node, self.vertices, self.cameras, emitters.samples_node(self)
-        )
+        emitters, inputs = self.method.emitters, (self.fragments_node, self.vertices, self.cameras)
+        return Node("beams", emitters.emission_towards_cameras, emission, *inputs, emitters.samples_node(self))
 
     def _sum_of(self, first: Node, second: Node) -> Node:
         """Node of the samples, of light of two kinds."""
@@ -244,11 +243,8 @@ class View(LitPoints):
 
         arguments = self.cameras, self.fragments_node, self.clip_positions
         points = self.cached("gloss", None, lambda: GlossyPoints(self.method, self, *arguments))
-        blockers_light = shading
-        if materials.emission:
-            blockers_light = self.transport.shading_without_emitters(self, light, materials)
-        openness = self.transport.openness(self, light, materials)
-        colored, white = points.mix(self, shading, light, materials, blockers_light, openness)
+        lobes = points.lit(light, self)
+        colored, white = points.mix(lobes, shading, materials, self.transport.blocked_radiance(lobes, materials))
         return self._sum_of(self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance))
 
     @property

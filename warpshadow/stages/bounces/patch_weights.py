@@ -141,7 +141,7 @@ def find_mean_transmittance(
 
 
 @wp.kernel
-def _find_weights(
+def _find_shares_and_weights(
     # in
     mean_transmittance: wp.array2d(dtype=wp.vec3),
     means: wp.array2d(dtype=wp.vec3),
@@ -190,5 +190,5 @@ def find_patch_weights(mean_transmittance: wp.array, mean: SparseMatrix, patch_o
     shares = empty(mean_transmittance.shape, dtype=wp.vec3, device=mean_transmittance.device)
     weights = empty(means.shape, dtype=wp.vec3, device=mean_transmittance.device)
     dim, inputs = (len(shares), shares.shape[1] + weights.shape[1]), [mean_transmittance, means, patch_indices]
-    launch(_find_weights, dim, inputs=inputs, outputs=[shares, weights])
+    launch(_find_shares_and_weights, dim, inputs=inputs, outputs=[shares, weights])
     return PatchWeights(shares, weights)

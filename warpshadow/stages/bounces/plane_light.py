@@ -105,7 +105,7 @@ def _light_receivers_adjoint(
     adj_normals: wp.array2d(dtype=wp.vec3),
     adj_transmittance: wp.array3d(dtype=wp.float32),
     adj_coverages: wp.array3d(dtype=wp.vec4),
-    adj_fronts: wp.array3d(dtype=wp.float32),
+    adj_front_weights: wp.array3d(dtype=wp.float32),
     # sums
     adj_frames: wp.array2d(dtype=wp.vec3),
     adj_texels: wp.array2d(dtype=wp.vec3),
@@ -164,7 +164,7 @@ def _light_receivers_adjoint(
                     adj_coverages[batch, index, q] = adj_coverages[batch, index, q] + adj_before
     if adj_normals:
         adj_normals[batch, index] = adj_normals[batch, index] + adj_normal
-    prepare_receiver_adjoint(receiver, inputs, adj_points, adj_fronts, adj_frames)
+    prepare_receiver_adjoint(receiver, inputs, adj_points, adj_front_weights, adj_frames)
 
 
 def plane_light(
@@ -177,7 +177,7 @@ def plane_light(
     directions: np.ndarray,
     *,
     coverages: wp.array | None = None,
-    fronts: wp.array | None = None,
+    front_weights: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array:
     """Light that planes send to receivers.
@@ -192,26 +192,28 @@ def plane_light(
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         coverages: Coverage (h, μ) of cells by bodies before all planes, which ``transmittance`` takes off, vec4 of
             shape [batch, receiver, direction]; None where it is not known.
-        fronts: Part of the front of each plane that receivers see, float32 of shape [batch, receiver, plane], from
-            :func:`warpshadow.stages.planes.fronts.find_fronts`; by default their heights decide.
+        front_weights: Part of the front of each plane that receivers see, float32 of shape [batch, receiver,
+            plane], from :func:`warpshadow.stages.planes.fronts.find_fronts`; by default their heights decide.
         skip: Number of the plane that the receivers are part of, which sends them nothing; None for none.
     Returns:
         Light that white receivers reflect of it, vec3 of shape [batch, receiver].
-    Differentiable: points, normals, transmittance, frames, texels, coverages, fronts.
+    Differentiable: points, normals, transmittance, frames, texels, coverages, front_weights.
     """
     check_planes(planes, points, frames, directions, skip)
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
     check.shape("transmittance", transmittance.shape, ("batch", points.shape[1], len(directions)))
     arguments = {"points": points, "normals": normals, "transmittance": transmittance, "coverages": coverages}
-    batch_count = common_batch({**arguments, "frames": frames, "texels": texels, "fronts": fronts})
+    batch_count = common_batch({**arguments, "frames": frames, "texels": texels, "front_weights": front_weights})
     if planes.count == (skip is not None):
         return zeros((batch_count, points.shape[1]), wp.vec3, points.device)
     points, normals = (expand(array, batch_count) for array in (points, normals))
     transmittance = expand_rows(transmittance, batch_count)
-    coverages, fronts = (None if array is None else expand_rows(array, batch_count) for array in (coverages, fronts))
+    coverages, front_weights = (
+        None if array is None else expand_rows(array, batch_count) for array in (coverages, front_weights)
+    )
     arrays = plane_arrays(planes, cell_radius(len(directions)), skip)
     cell_directions = constant(directions, wp.vec3, points.device)
-    planes_seen = plane_inputs(points, frames, fronts, arrays)
+    planes_seen = plane_inputs(points, frames, front_weights, arrays)
     inputs = [planes_seen, normals, transmittance, coverages, texels, cell_directions]
     return launch_with_adjoint(
         _light_receivers,
@@ -219,7 +221,7 @@ def plane_light(
         points.size,
         inputs=inputs,
         result=empty(points.shape, dtype=wp.vec3, device=points.device),
-        variables=[points, normals, transmittance, coverages, fronts],
+        variables=[points, normals, transmittance, coverages, front_weights],
         shared=[frames, texels],
         scratch=[*receiver_scratch(planes), hit_scratch(planes)],
         adj_scratch=[hit_scratch(planes)],

@@ -50,7 +50,7 @@ def _tilt_normals(
     normals: wp.array2d(dtype=wp.vec3),
     radii: wp.array2d(dtype=wp.float32),
     spheres: wp.array(dtype=wp.int32),
-    fronts: wp.array3d(dtype=wp.float32),
+    front_weights: wp.array3d(dtype=wp.float32),
     frames: wp.array2d(dtype=wp.vec3),
     grids: wp.array(dtype=PlaneGrid),
     # out
@@ -70,7 +70,7 @@ def _tilt_normals(
             v = frames[frame_batch, 3 * plane + 2]
             plane_normal = wp.normalize(wp.cross(u, v))
             up_component = wp.dot(normal, plane_normal)
-            front = fronts[instance_in(batch, fronts.shape[0]), patch_sample, plane]
+            front = front_weights[instance_in(batch, front_weights.shape[0]), patch_sample, plane]
             tilt = front * wp.max(-up_component, 0.0) - (1.0 - front) * wp.max(up_component, 0.0)
             if grid.blocks != 0 and radius > 0.0:
                 offset = point - frames[frame_batch, 3 * plane]
@@ -89,7 +89,7 @@ def tilt_normals_off_planes(
     normals: wp.array,
     radii: wp.array,
     spheres: np.ndarray,
-    fronts: wp.array,
+    front_weights: wp.array,
     frames: wp.array,
     planes: PlaneBlockers,
 ) -> wp.array:
@@ -101,28 +101,28 @@ def tilt_normals_off_planes(
         radii: Radii of spheres [scene units], float32 of shape [batch, sphere].
         spheres: The blocker nearest to the patch of each patch sample, −1 for none, which keeps its normal: NumPy of
             shape [patch sample].
-        fronts: Part of the front of each plane that patch samples see, float32 of shape [batch, patch sample, plane],
-            from :func:`.fronts.find_fronts`.
+        front_weights: Part of the front of each plane that patch samples see, float32 of shape [batch, patch sample,
+            plane], from :func:`.fronts.find_fronts`.
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`.
         planes: The planes. Planes that cast no shadow do not count.
     Returns:
         n′, vec3 of shape [batch, patch sample]. Any batch may be 1.
-    Differentiable: points, normals, radii, fronts, frames.
+    Differentiable: points, normals, radii, front_weights, frames.
     """
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
     check.shape("spheres", spheres.shape, (points.shape[1],))
     check.shape("frames", frames.shape, ("batch", 3 * planes.count))
     if len(spheres) and spheres.max() >= radii.shape[1]:
         raise ValueError(f"spheres: got {spheres.max()}, expected −1 to {radii.shape[1] - 1}")
-    check.shape("fronts", fronts.shape, ("batch", points.shape[1], planes.count))
-    arguments = {"points": points, "normals": normals, "radii": radii, "fronts": fronts, "frames": frames}
+    check.shape("front_weights", front_weights.shape, ("batch", points.shape[1], planes.count))
+    arguments = {"points": points, "normals": normals, "radii": radii, "front_weights": front_weights, "frames": frames}
     batch_count = common_batch(arguments)
     tilted_normals = empty((batch_count, points.shape[1]), dtype=wp.vec3, device=points.device)
     blocker_indices = constant(np.asarray(spheres, np.int32), wp.int32, points.device)
     launch(
         _tilt_normals,
         tilted_normals.shape,
-        inputs=[points, normals, radii, blocker_indices, fronts, frames, planes.grids],
+        inputs=[points, normals, radii, blocker_indices, front_weights, frames, planes.grids],
         outputs=[tilted_normals],
     )
     return tilted_normals

@@ -97,7 +97,7 @@ class ConvexBlockers:
             SparseMatrix.from_matrix(_selection_matrix(vertices, vertex_count), device=device),
         )
 
-    def placed(self, positions: wp.array) -> PlacedParts:
+    def place(self, positions: wp.array) -> PlacedParts:
         """Convex parts in the world.
 
         Args:

@@ -444,7 +444,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
 
 def part_coverage(
     points: wp.array,
-    placed: PlacedParts,
+    placed_parts: PlacedParts,
     blockers: ConvexBlockers,
     directions: np.ndarray,
     *,
@@ -457,7 +457,7 @@ def part_coverage(
 
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
-        placed: Where the parts are, from :meth:`.ConvexBlockers.placed`; the batch may be 1.
+        placed_parts: Where the parts are, from :meth:`.ConvexBlockers.place`; the batch may be 1.
         blockers: The bodies.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         radius: Of cells that do not tile the sphere [rad]; by default that of so many even ones, which do.
@@ -469,25 +469,25 @@ def part_coverage(
     Returns:
         vec4 of shape [batch, receiver, direction], for :func:`warpshadow.stages.joint_coverage.transmittance_past`.
 
-    Differentiable: points, placed. Not: horizon_normals, which decides by steps.
+    Differentiable: points, placed_parts. Not: horizon_normals, which decides by steps.
     """
     check.shape("points", points.shape, ("batch", "receiver"))
     check.shape("directions", directions.shape, ("direction", 3))
     if skip is not None:
         check.choice("skip", skip, range(blockers.body_count))
-    points = expand(points, common_batch({"points": points, "corners": placed.corners}))
+    points = expand(points, common_batch({"points": points, "corners": placed_parts.corners}))
     inputs = PartInputs()
     inputs.points, inputs.parts, inputs.cells = points, blockers.arrays, make_cells(directions, SOFTNESS, points.device)
     if horizon_normals is not None:
         inputs.horizon_normals = horizon_normals
-    inputs.corners, inputs.face_planes, inputs.bounds = placed
+    inputs.corners, inputs.face_planes, inputs.bounds = placed_parts
     inputs.radius = cell_radius(len(directions)) if radius is None else radius
     inputs.skip = -1 if skip is None else skip
     inputs.on_surface = on_surface
     lanes = lane_count(points.device)
     Lane, sums, edge_count = lane_type(lanes), sums_type(lanes), blockers.edge_count
     by_cell = (len(directions),)
-    cost = _PART_COST * lanes * placed.bounds.shape[1]
+    cost = _PART_COST * lanes * placed_parts.bounds.shape[1]
     return launch_with_adjoint(
         _make_cover(lanes),
         lambda: _make_cover_adjoint(lanes),
@@ -495,7 +495,7 @@ def part_coverage(
         inputs=[inputs],
         result=empty((*points.shape, len(directions)), dtype=wp.vec4, device=points.device),
         variables=[points],
-        shared=[placed.corners],
+        shared=[placed_parts.corners],
         scratch=[
             *(Scratch(by_cell, dtype) for dtype in (coverage_type(lanes), wp.int32, sums)),
             Scratch((SUM_LANES,), Lane),

@@ -329,7 +329,7 @@ def find_log_transmittance_of_parts(
     normals: wp.array,
     samples: PlacedSamples,
     span: EmitterSpan,
-    placed: PlacedParts,
+    placed_parts: PlacedParts,
     blockers: ConvexBlockers,
     skipped: tuple[int, int],
 ) -> wp.array:
@@ -337,20 +337,20 @@ def find_log_transmittance_of_parts(
 
     Args:
         points, normals, samples, span: As for :func:`.sphere_transmittance.find_log_transmittance`.
-        placed: Where the parts are.
+        placed_parts: Where the parts are.
         blockers: The bodies that consist of them.
         skipped: Indices of bodies among these that do not block, −1 for none: the receivers' and the emitter's.
     Returns:
         Float32 of shape [batch, receiver, sample].
     Differentiable: points, samples, corners of placed parts. Not: normals.
     """
-    count = common_batch({"points": points, "emitters": samples.points, "parts": placed.corners})
+    count = common_batch({"points": points, "emitters": samples.points, "parts": placed_parts.corners})
     points = expand(points, count)
     inputs = BeamInputs()
     inputs.points, inputs.normals = points, normals
     inputs.sample_points, inputs.sample_areas, inputs.balls = samples.points, samples.areas, samples.balls
     inputs.emitter, inputs.first_sample, inputs.is_two_sided = span.emitter, span.first, int(span.is_two_sided)
-    inputs.corners, inputs.planes, inputs.bounds = placed
+    inputs.corners, inputs.planes, inputs.bounds = placed_parts
     inputs.arrays, inputs.skipped = blockers.arrays, wp.vec2i(*skipped)
     return launch_with_adjoint(
         _block_by_pieces,
@@ -359,7 +359,7 @@ def find_log_transmittance_of_parts(
         inputs=[inputs],
         result=empty((count, points.shape[1], span.size), dtype=wp.float32, device=points.device),
         variables=[points],
-        shared=[samples.points, samples.areas, placed.corners],
+        shared=[samples.points, samples.areas, placed_parts.corners],
         scratch=[Scratch((span.size,), wp.float32)],
-        cost=_COST * placed.bounds.shape[1],
+        cost=_COST * placed_parts.bounds.shape[1],
     )

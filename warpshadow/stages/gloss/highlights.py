@@ -56,7 +56,7 @@ def _sum_highlights(
     transmittance: wp.array3d(dtype=wp.float32),
     # out
     straight: wp.array2d(dtype=wp.vec3),
-    grazing_light: wp.array2d(dtype=wp.vec3),
+    grazing: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver of an instance: G and G'."""
     batch, receiver = split_row(first_row + wp.tid(), straight.shape[1])
@@ -68,7 +68,7 @@ def _sum_highlights(
     rough = wp.max(roughness[instance_in(batch, roughness.shape[0]), receiver], MIN_ROUGHNESS)
     sample_batch = instance_in(batch, sample_points.shape[0])
     radiance_batch = instance_in(batch, radiance.shape[0])
-    lobe_sum = wp.vec3()
+    straight_sum = wp.vec3()
     grazing_sum = wp.vec3()
     for i in range(sample_count):
         beam = sample_points[sample_batch, first_sample + i] - point
@@ -86,10 +86,10 @@ def _sum_highlights(
             weight = weight * _reflect(wp.dot(normal, mirror), cosine, view_cosine, square)
             base = wp.max(1.0 - wp.dot(view, mirror), 0.0)
             light = weight * radiance[radiance_batch, first_sample + i]
-            lobe_sum += light
+            straight_sum += light
             grazing_sum += base * base * base * base * base * light
-    straight[batch, receiver] = lobe_sum
-    grazing_light[batch, receiver] = grazing_sum
+    straight[batch, receiver] = straight_sum
+    grazing[batch, receiver] = grazing_sum
 
 
 def sum_highlights(
@@ -118,7 +118,7 @@ def sum_highlights(
     arrays |= {"emitters": samples.points, "emission": radiance, "transmittance": transmittance}
     count = common_batch(arrays)
     points, normals, roughness = (expand(array, count) for array in (points, normals, roughness))
-    lobe_sums = [empty((count, points.shape[1]), dtype=wp.vec3, device=points.device) for _ in range(2)]
+    sums = [empty((count, points.shape[1]), dtype=wp.vec3, device=points.device) for _ in range(2)]
     launch(
         _sum_highlights,
         count * points.shape[1],
@@ -136,8 +136,8 @@ def sum_highlights(
             *(span.first, span.size, int(span.is_two_sided)),
             None if transmittance is None else expand_rows(transmittance, count),
         ],
-        outputs=lobe_sums,
+        outputs=sums,
         shared=[clip_matrices, samples.points, samples.areas, radiance],
         cost=_COST * span.size,
     )
-    return LobeLight(*lobe_sums)
+    return LobeLight(*sums)

@@ -46,7 +46,7 @@ def _sum_lobes(
     blocked_light: wp.array2d(dtype=wp.vec3),
     # out
     straight: wp.array2d(dtype=wp.vec3),
-    grazing_light: wp.array2d(dtype=wp.vec3),
+    grazing: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver: G and G'."""
     batch, receiver = split_row(first_row + wp.tid(), straight.shape[1])
@@ -56,16 +56,16 @@ def _sum_lobes(
     blocked_radiance = wp.vec3()
     if blocked_light:
         blocked_radiance = blocked_light[instance_in(batch, blocked_light.shape[0]), receiver]
-    lobe_sum = wp.vec3()
-    total_grazing = wp.vec3()
+    straight_sum = wp.vec3()
+    grazing_sum = wp.vec3()
     for i in range(filters.shape[2]):
         weight = filters[filter_batch, receiver, i]
         share = transmittance[transmittance_batch, receiver, i]
         radiance = share * light[light_batch, receiver, i] + (1.0 - share) * blocked_radiance
-        lobe_sum += weight[0] * radiance
-        total_grazing += weight[1] * radiance
-    straight[batch, receiver] = lobe_sum
-    grazing_light[batch, receiver] = total_grazing
+        straight_sum += weight[0] * radiance
+        grazing_sum += weight[1] * radiance
+    straight[batch, receiver] = straight_sum
+    grazing[batch, receiver] = grazing_sum
 
 
 class LobeLight(NamedTuple):
@@ -89,23 +89,18 @@ def sum_lobes(
 
     Differentiable: all.
     """
-    arrays = {
-        "filters": filters,
-        "light": light,
-        "transmittance": transmittance,
-        "blocked_light": blocked_light,
-    }
+    arrays = {"filters": filters, "light": light, "transmittance": transmittance, "blocked_light": blocked_light}
     count = common_batch(arrays)
-    lobe_sums = [wp.empty((count, filters.shape[1]), dtype=wp.vec3, device=filters.device) for _ in range(2)]
+    sums = [wp.empty((count, filters.shape[1]), dtype=wp.vec3, device=filters.device) for _ in range(2)]
     launch(
         _sum_lobes,
         count * filters.shape[1],
         inputs=[filters, light, transmittance, blocked_light],
-        outputs=lobe_sums,
+        outputs=sums,
         shared=[array for array in arrays.values() if array is not None and len(array) < count],
         cost=_COST * filters.shape[2],
     )
-    return LobeLight(*lobe_sums)
+    return LobeLight(*sums)
 
 
 @wp.kernel
@@ -172,7 +167,7 @@ def _mix_reflection(
     receiver_indices: wp.array(dtype=wp.int32),
     diffuse: wp.array2d(dtype=wp.vec3),
     straight: wp.array2d(dtype=wp.vec3),
-    grazing_light: wp.array2d(dtype=wp.vec3),
+    grazing: wp.array2d(dtype=wp.vec3),
     cosines: wp.array2d(dtype=wp.float32),
     metallic: wp.array2d(dtype=wp.float32),
     specular: wp.array2d(dtype=wp.float32),
@@ -189,8 +184,8 @@ def _mix_reflection(
         colored_reflection[batch, receiver] = light
         white[batch, receiver] = wp.vec3()
     else:
-        lobe = straight[instance_in(batch, straight.shape[0]), receiver_index]
-        grazing_lobe = grazing_light[instance_in(batch, grazing_light.shape[0]), receiver_index]
+        straight_light = straight[instance_in(batch, straight.shape[0]), receiver_index]
+        grazing_light = grazing[instance_in(batch, grazing.shape[0]), receiver_index]
         m = metallic[instance_in(batch, metallic.shape[0]), receiver_index]
         s = specular[instance_in(batch, specular.shape[0]), receiver_index]
         slant = 1.0 - cosines[instance_in(batch, cosines.shape[0]), receiver_index]
@@ -198,10 +193,12 @@ def _mix_reflection(
         reflectance = DIELECTRIC_F0 + (1.0 - DIELECTRIC_F0) * (
             even_coefficients[0] + slant * (even_coefficients[1] + slant * even_coefficients[2])
         )
-        colored_reflection[batch, receiver] = (1.0 - m) * (1.0 - s * reflectance) * light + m * (lobe - grazing_lobe)
+        colored_reflection[batch, receiver] = (1.0 - m) * (1.0 - s * reflectance) * light + m * (
+            straight_light - grazing_light
+        )
         white[batch, receiver] = (1.0 - m) * s * (
-            DIELECTRIC_F0 * lobe + (1.0 - DIELECTRIC_F0) * grazing_lobe
-        ) + m * grazing_lobe
+            DIELECTRIC_F0 * straight_light + (1.0 - DIELECTRIC_F0) * grazing_light
+        ) + m * grazing_light
 
 
 @wp.kernel(enable_backward=False)
@@ -247,7 +244,7 @@ def mix_reflection(
     receiver_indices: wp.array,
     diffuse: wp.array,
     straight: wp.array,
-    grazing_light: wp.array,
+    grazing: wp.array,
     cosines: wp.array,
     metallic: wp.array,
     specular: wp.array,
@@ -257,7 +254,7 @@ def mix_reflection(
     Args:
         receiver_indices: Of each receiver among the glossy ones, −1 for diffuse ones, int32 of shape [receiver].
         diffuse: E, light that receivers would reflect as white diffuse surfaces, vec3 of shape [batch, receiver].
-        straight, grazing_light: G and G' of the glossy ones, vec3 of shape [batch, glossy].
+        straight, grazing: G and G' of the glossy ones, vec3 of shape [batch, glossy].
         cosines: μ of them, float32 of shape [batch, glossy].
         metallic, specular: m and s of them, float32 of shape [batch, glossy].
 
@@ -267,6 +264,6 @@ def mix_reflection(
     arrays = {"diffuse": diffuse, "gloss": straight, "cosines": cosines, "metallic": metallic, "specular": specular}
     shape = common_batch(arrays), diffuse.shape[1]
     reflected = ReflectedLight(*(wp.empty(shape, dtype=wp.vec3, device=diffuse.device) for _ in range(2)))
-    inputs = [receiver_indices, diffuse, straight, grazing_light, cosines, metallic, specular, even_grazing()]
+    inputs = [receiver_indices, diffuse, straight, grazing, cosines, metallic, specular, even_grazing()]
     launch(_mix_reflection, shape, inputs=inputs, outputs=[*reflected])
     return reflected

@@ -30,6 +30,7 @@ from warpshadow.maths import sh
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.gloss.lobes import Lobes
 from warpshadow.stages.gloss.reflection import LobeLight
+from warpshadow.stages.gloss.transmittance import horizon_weight
 
 _MAX_SUNS = 8
 _BRIGHTNESS = 10.0  # radiance above which a pixel may be of a sun, in means of the map
@@ -40,8 +41,6 @@ _ISOLATION = 0.9  # of the bright light within twice that radius, that is within
 _RIM = 1.25  # where a disc has ended, in radii: as far as that nothing beside it is half as bright
 _MAX_AREA = 1.2  # size of a sun, in discs of that radius: a pixel of a coarse map is larger
 _MAX_TRIALS = 32  # brightest spots that are tried
-
-_MIN_HORIZON_WEIGHT = 1.0e-7
 
 _COST = 20.0  # nanoseconds that a sun takes
 
@@ -56,14 +55,18 @@ class Suns(NamedTuple):
     solid_angles: np.ndarray  # Ω [sr], [sun]
 
 
-def separate_suns(radiance: np.ndarray) -> tuple[Suns, np.ndarray]:
+class SeparatedLight(NamedTuple):
+    """A map that is separated from its suns."""
+
+    suns: Suns
+    rest: np.ndarray  # the map, in which their pixels are cut to ten times its mean radiance
+
+
+def separate_suns(radiance: np.ndarray) -> SeparatedLight:
     """Separate suns from a map, at most 8: discs of up to 6° in radius that are much brighter than all on average.
 
     Args:
         radiance: Linear RGB, shape [height, 2·height, 3].
-
-    Returns:
-        The suns, and the map, in which their pixels are cut to ten times its mean radiance.
     """
     solid_angles = np.repeat(sh.pixel_solid_angles(len(radiance)), 2 * len(radiance))
     brightness = radiance.mean(axis=2, dtype=np.float64).ravel()
@@ -104,7 +107,8 @@ def separate_suns(radiance: np.ndarray) -> tuple[Suns, np.ndarray]:
     rest = radiance.reshape(-1, 3).copy()
     rest[pixels[is_sun]] *= (1 - shares[is_sun])[:, None]
     columns = np.array([[*direction, *irradiance, size] for direction, irradiance, size in suns]).reshape(-1, 7)
-    return Suns(columns[:, :3], columns[:, 3:6], columns[:, 6]), rest.reshape(radiance.shape)
+    suns_of_map = Suns(columns[:, :3], columns[:, 3:6], columns[:, 6])
+    return SeparatedLight(suns_of_map, rest.reshape(radiance.shape))
 
 
 def directions_in_suns(suns: Suns, count: int) -> np.ndarray:
@@ -139,10 +143,8 @@ def _find_sun_transmittance(
     transmittance_batch = instance_in(batch, transmittance.shape[0])
     for i in range(cells.shape[0]):
         height = wp.clamp(0.5 * per_radius * wp.dot(normal, directions[i]) + 0.5, 0.0, 1.0)
-        above = height * height * (3.0 - 2.0 * height) + _MIN_HORIZON_WEIGHT
-        sun_transmittance[batch, receiver, i] = wp.min(
-            transmittance[transmittance_batch, receiver, cells[i]] / above, 1.0
-        )
+        cell_transmittance = transmittance[transmittance_batch, receiver, cells[i]]
+        sun_transmittance[batch, receiver, i] = wp.min(cell_transmittance / horizon_weight(height), 1.0)
 
 
 def find_sun_transmittance(
@@ -221,7 +223,7 @@ def _reflect_suns(
     solid_angles: wp.array(dtype=wp.float32),
     transmittance: wp.array3d(dtype=wp.float32),
     straight: wp.array2d(dtype=wp.vec3),
-    grazing_light: wp.array2d(dtype=wp.vec3),
+    grazing: wp.array2d(dtype=wp.vec3),
     # out
     straight_sum: wp.array2d(dtype=wp.vec3),
     grazing_sum: wp.array2d(dtype=wp.vec3),
@@ -237,8 +239,8 @@ def _reflect_suns(
     width = widths[lobe_batch, receiver]
     count = transmittance.shape[2] / directions.shape[0]  # directions of each sun
     transmittance_batch = instance_in(batch, transmittance.shape[0])
-    lobe_sum = wp.vec3()
-    total_grazing = wp.vec3()
+    straight_suns = wp.vec3()
+    grazing_suns = wp.vec3()
     for i in range(directions.shape[0]):
         cosine = wp.dot(normal, directions[i])
         if cosine > 0.0:
@@ -246,10 +248,10 @@ def _reflect_suns(
             weights = _reflect_disc(view, width, towards, solid_angles[i]) / float(count)
             for k in range(count):
                 light = transmittance[transmittance_batch, receiver, i * count + k] * irradiance[i]
-                lobe_sum += weights[0] * light
-                total_grazing += weights[1] * light
-    straight_sum[batch, receiver] = straight[light_batch, receiver] + lobe_sum
-    grazing_sum[batch, receiver] = grazing_light[light_batch, receiver] + total_grazing
+                straight_suns += weights[0] * light
+                grazing_suns += weights[1] * light
+    straight_sum[batch, receiver] = straight[light_batch, receiver] + straight_suns
+    grazing_sum[batch, receiver] = grazing[light_batch, receiver] + grazing_suns
 
 
 def add_suns(lobe_light: LobeLight, lobes: Lobes, suns: Suns, transmittance: wp.array) -> LobeLight:
@@ -265,6 +267,8 @@ def add_suns(lobe_light: LobeLight, lobes: Lobes, suns: Suns, transmittance: wp.
     Differentiable: all but suns.
     """
     device = transmittance.device
+    if not len(suns.directions):
+        return lobe_light
     if transmittance.shape[2] % len(suns.directions):
         raise ValueError(f"transmittance: got {transmittance.shape[2]} directions of {len(suns.directions)} suns")
     arrays = {"lobe_light": lobe_light.straight, "lobes": lobes.normals, "transmittance": transmittance}

@@ -40,6 +40,12 @@ def _horizon_weights(heights: Chunk):
     return wp.cw_mul(wp.cw_mul(heights, heights), Chunk(3.0) - 2.0 * heights) + Chunk(_MIN_HORIZON_WEIGHT)
 
 
+@wp.func
+def horizon_weight(height: float):
+    """The same of one cell."""
+    return height * height * (3.0 - 2.0 * height) + _MIN_HORIZON_WEIGHT
+
+
 @wp.func(inline=True)
 def _kernels(direction: wp.vec3, x: Chunk, y: Chunk, z: Chunk, reach_cosine: float):
     """√k of cells, but for ε."""

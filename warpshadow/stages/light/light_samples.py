@@ -17,8 +17,8 @@ SET_COUNT = 16
 
 _UNIFORM_SHARE = 0.1  # of the samples of a map: light too dim to be drawn still is
 
-_SUN_BRIGHTNESS = 30.0  # times as bright as all on average is a sun …
-_SUN_SHARE = 0.35  # … and suns get so much of shared directions at most
+_SUN_BRIGHTNESS = 30.0  # radiance, in means of the map, from which shared directions are aimed at a pixel …
+_SUN_SHARE = 0.35  # … and such pixels get so much of them at most
 _UNSEEN_SHARE = 0.3  # of the importance of light, which stays where receivers do not see it
 _MIN_ROWS, _MAX_ROWS = 64, 512  # of a map that is cut
 

@@ -153,29 +153,29 @@ def find_local_receiver_adjoint(
 
 @wp.func
 def front_of(
-    fronts: wp.array3d(dtype=wp.float32), grid: PlaneGrid, height: float, batch: int, receiver: int, plane: int
+    front_weights: wp.array3d(dtype=wp.float32), grid: PlaneGrid, height: float, batch: int, receiver: int, plane: int
 ):
     """Part of the front that a receiver sees, as it is given or by its height."""
-    if fronts:
-        return fronts[batch, receiver, plane]
+    if front_weights:
+        return front_weights[batch, receiver, plane]
     return front_weight(grid, height)
 
 
 @wp.func
 def front_of_adjoint(
-    fronts: wp.array3d(dtype=wp.float32),
+    front_weights: wp.array3d(dtype=wp.float32),
     grid: PlaneGrid,
     height: float,
     adj_front: float,
     batch: int,
     receiver: int,
     plane: int,
-    adj_fronts: wp.array3d(dtype=wp.float32),
+    adj_front_weights: wp.array3d(dtype=wp.float32),
 ):
-    """Add to the gradient of the fronts, or return that of the height where there are none."""
-    if fronts:
-        if adj_fronts:
-            adj_fronts[batch, receiver, plane] = adj_fronts[batch, receiver, plane] + adj_front
+    """Add to the gradient of the front weights, or return that of the height where there are none."""
+    if front_weights:
+        if adj_front_weights:
+            adj_front_weights[batch, receiver, plane] = adj_front_weights[batch, receiver, plane] + adj_front
         return float(0.0)
     return adj_front * front_weight_slope(grid, height)
 

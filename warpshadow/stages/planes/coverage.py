@@ -152,7 +152,7 @@ def _find_coverage_adjoint(
     edges: wp.array2d(dtype=ViewedEdge),
     # out
     adj_points: wp.array2d(dtype=wp.vec3),
-    adj_fronts: wp.array3d(dtype=wp.float32),
+    adj_front_weights: wp.array3d(dtype=wp.float32),
     # sums
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
@@ -167,7 +167,7 @@ def _find_coverage_adjoint(
                 if wp.length_sq(adj_coverage) > 0.0 and is_above_horizon(normal, directions[q]):
                     cell = visible_cell(inputs.planes, normal, directions[q])
                     side_coverage_adjoint(inputs.planes, side, cell, adj_coverage, receiver)
-    prepare_receiver_adjoint(receiver, inputs, adj_points, adj_fronts, adj_frames)
+    prepare_receiver_adjoint(receiver, inputs, adj_points, adj_front_weights, adj_frames)
 
 
 def plane_coverage(
@@ -178,7 +178,7 @@ def plane_coverage(
     *,
     radius: float | None = None,
     horizon_normals: wp.array | None = None,
-    fronts: wp.array | None = None,
+    front_weights: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array | None:
     """Coverage (h, μ) of cells by the planes that cast shadows: an h of 1 and more need not be complete.
@@ -191,31 +191,31 @@ def plane_coverage(
         radius: Of cells that do not tile the sphere [rad], how soft edges and horizons are; by default that of so many
             even ones, which do.
         horizon_normals: Normals, vec3 of shape [batch, receiver]: nothing covers cells below the horizon.
-        fronts: Part of the front of each plane that receivers see, from :func:`.fronts.find_fronts`, float32 of shape
-            [batch, receiver, plane]; by default their heights decide.
+        front_weights: Part of the front of each plane that receivers see, from :func:`.fronts.find_fronts`, float32 of
+            shape [batch, receiver, plane]; by default their heights decide.
         skip: Number of the plane that the receivers are part of, which blocks none of their light; None for none.
     Returns:
         vec4 of shape [batch, receiver, direction], for :func:`warpshadow.stages.joint_coverage.transmittance_past`; h
         is 1 or more where nothing passes. None where no plane casts a shadow on them.
-    Differentiable: points, frames, fronts. Not: horizon_normals, which decide by steps,
+    Differentiable: points, frames, front_weights. Not: horizon_normals, which decide by steps,
     and how much receivers in a plane see of a cell.
     """
     check_planes(planes, points, frames, directions, skip)
-    count = common_batch({"points": points, "frames": frames, "fronts": fronts})
-    points, fronts = expand(points, count), None if fronts is None else expand_rows(fronts, count)
+    count = common_batch({"points": points, "frames": frames, "front_weights": front_weights})
+    points, front_weights = expand(points, count), None if front_weights is None else expand_rows(front_weights, count)
     radius_of_cells = cell_radius(len(directions)) if radius is None else radius
     arrays = plane_arrays(planes, radius_of_cells, skip)
     if not set(planes.is_blocking) - {skip}:
         return None
     cells = constant(directions, wp.vec3, points.device)
-    inputs = [plane_inputs(points, frames, fronts, arrays), horizon_normals, cells]
+    inputs = [plane_inputs(points, frames, front_weights, arrays), horizon_normals, cells]
     return launch_with_adjoint(
         _find_coverage,
         _find_coverage_adjoint,
         points.size,
         inputs=inputs,
         result=empty((*points.shape, cells.size), dtype=wp.vec4, device=points.device),
-        variables=[points, fronts],
+        variables=[points, front_weights],
         shared=[frames],
         scratch=receiver_scratch(planes),
         cost=_CELL_COST * cells.size * planes.count,

@@ -187,8 +187,8 @@ def _find_fronts(
     grids: wp.array(dtype=PlaneGrid),
     skip: int,
     # out
-    fronts: wp.array3d(dtype=wp.float32),
-    lifted: wp.array2d(dtype=wp.vec3),
+    front_weights: wp.array3d(dtype=wp.float32),
+    lifted_points: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a point of an instance."""
     batch, receiver = wp.tid()
@@ -223,15 +223,15 @@ def _find_fronts(
                 nearness = 1.0 - relative_height * relative_height
                 lift = (2.0 * front - 1.0) * nearness * nearness * _LIFT_IN_MARGINS * margin
                 offset += lift * wp.length(axis_u) * plane_normal
-        fronts[batch, receiver, plane] = front
-    lifted[batch, receiver] = point + offset
+        front_weights[batch, receiver, plane] = front
+    lifted_points[batch, receiver] = point + offset
 
 
-class Fronts(NamedTuple):
+class PlaneFronts(NamedTuple):
     """On which side of planes receivers are."""
 
-    weights: wp.array  # float32 of shape [batch, receiver, plane], 0 to 1: of the front; the back has the rest
-    lifted: wp.array  # the receivers, lifted off the planes in which they lie, vec3 of shape [batch, receiver]
+    front_weights: wp.array  # float32 of shape [batch, receiver, plane], from 1 in front of it to 0 behind it
+    lifted_points: wp.array  # the receivers, lifted off the planes in which they lie, vec3 of shape [batch, receiver]
 
 
 def find_fronts(
@@ -244,7 +244,7 @@ def find_fronts(
     *,
     body: int = 0,
     skip: int | None = None,
-) -> Fronts:
+) -> PlaneFronts:
     """Weight of each plane's front for each receiver, and receivers lifted off planes in which they lie.
 
     Args:
@@ -266,8 +266,8 @@ def find_fronts(
         check.shape("blocker_indices", blocker_indices.shape, (points.shape[1],))
     arguments = {"points": points, "normals": normals, "centers": centers, "radii": radii, "frames": frames}
     shape = common_batch({**arguments, "body_sides": body_sides}), points.shape[1]
-    weights = empty((*shape, planes.count), dtype=wp.float32, device=points.device)
-    lifted = empty(shape, dtype=wp.vec3, device=points.device)
+    front_weights = empty((*shape, planes.count), dtype=wp.float32, device=points.device)
+    lifted_points = empty(shape, dtype=wp.vec3, device=points.device)
     inputs = [points, normals, body_sides, body, centers, radii, blocker_indices, frames, planes.grids]
-    launch(_find_fronts, shape, inputs=[*inputs, -1 if skip is None else skip], outputs=[weights, lifted])
-    return Fronts(weights, lifted)
+    launch(_find_fronts, shape, inputs=[*inputs, -1 if skip is None else skip], outputs=[front_weights, lifted_points])
+    return PlaneFronts(front_weights, lifted_points)

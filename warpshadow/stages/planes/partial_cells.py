@@ -144,7 +144,7 @@ def _refine_coverage_adjoint(
     # out
     adj_points: wp.array2d(dtype=wp.vec3),
     adj_covered: wp.array3d(dtype=wp.vec4),
-    adj_fronts: wp.array3d(dtype=wp.float32),
+    adj_front_weights: wp.array3d(dtype=wp.float32),
     # sums
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
@@ -176,7 +176,7 @@ def _refine_coverage_adjoint(
             adj_covered[batch, index, q] = adj_covered[batch, index, q] + wp.vec4(
                 slope * adj_share, adj_cell[1], adj_cell[2], adj_cell[3]
             )
-    prepare_receiver_adjoint(receiver, inputs, adj_points, adj_fronts, adj_frames)
+    prepare_receiver_adjoint(receiver, inputs, adj_points, adj_front_weights, adj_frames)
 
 
 def coverage_of_light(
@@ -188,36 +188,37 @@ def coverage_of_light(
     samples: np.ndarray,
     *,
     horizon_normals: wp.array | None = None,
-    fronts: wp.array | None = None,
+    front_weights: wp.array | None = None,
     skip: int | None = None,
 ) -> wp.array:
     """Coverage of the light of cells, C′: more exact than that of cells where planes cover them in part.
 
     Args:
-        points, frames, planes, directions, horizon_normals, fronts, skip: As for :func:`.coverage.plane_coverage`.
+        points, frames, planes, directions, horizon_normals, front_weights, skip: As for
+            :func:`.coverage.plane_coverage`.
         covered: Its result, (C, μ), vec4 of shape [batch, receiver, direction].
         samples: Eight directions drawn from the light of each cell, NumPy of shape [direction, 8, 3].
     Returns:
         (C′, μ), of the same shape.
-    Differentiable: points, covered, frames, fronts. Not: horizon_normals, which decide by steps,
+    Differentiable: points, covered, frames, front_weights. Not: horizon_normals, which decide by steps,
     and how much directions count for receivers in a plane.
     """
     check.shape("samples", samples.shape, (len(directions), SAMPLES, 3))
     check_planes(planes, points, frames, directions, skip)
     check.shape("covered", covered.shape, ("batch", points.shape[1], len(directions)))
-    count = common_batch({"points": points, "frames": frames, "fronts": fronts, "covered": covered})
+    count = common_batch({"points": points, "frames": frames, "front_weights": front_weights, "covered": covered})
     points, covered = expand(points, count), expand_rows(covered, count)
-    fronts = None if fronts is None else expand_rows(fronts, count)
+    front_weights = None if front_weights is None else expand_rows(front_weights, count)
     arrays = plane_arrays(planes, cell_radius(SAMPLES * len(directions)), skip)
     samples_on_device = constant(np.asarray(samples, np.float32), wp.vec3, points.device)
-    inputs = [plane_inputs(points, frames, fronts, arrays), horizon_normals, covered, samples_on_device]
+    inputs = [plane_inputs(points, frames, front_weights, arrays), horizon_normals, covered, samples_on_device]
     return launch_with_adjoint(
         _refine_coverage,
         _refine_coverage_adjoint,
         points.size,
         inputs=inputs,
         result=empty(covered.shape, dtype=wp.vec4, device=points.device),
-        variables=[points, covered, fronts],
+        variables=[points, covered, front_weights],
         shared=[frames],
         scratch=receiver_scratch(planes),
         cost=_CELL_COST * len(directions),

@@ -34,16 +34,18 @@ class PlaneInputs:
 
     points: wp.array2d(dtype=wp.vec3)
     frames: wp.array2d(dtype=wp.vec3)
-    fronts: wp.array3d(dtype=wp.float32)  # none where heights decide
+    front_weights: wp.array3d(dtype=wp.float32)  # none where heights decide
     planes: PlaneArrays
 
 
-def plane_inputs(points: wp.array, frames: wp.array, fronts: wp.array | None, planes: PlaneArrays) -> PlaneInputs:
+def plane_inputs(
+    points: wp.array, frames: wp.array, front_weights: wp.array | None, planes: PlaneArrays
+) -> PlaneInputs:
     """Put receivers together with the planes around them, for kernels."""
     inputs = PlaneInputs()
     inputs.points, inputs.frames, inputs.planes = points, frames, planes
-    if fronts is not None:
-        inputs.fronts = fronts
+    if front_weights is not None:
+        inputs.front_weights = front_weights
     return inputs
 
 
@@ -261,7 +263,9 @@ def prepare_receiver(
             local_receiver = find_local_receiver(inputs.points[batch, index], inputs.frames[frame_batch], plane)
             if wp.length_sq(local_receiver.normal) > 0.0:
                 # below the plane the front fades, and the back takes over
-                front = front_of(inputs.fronts, planes.grids[plane], local_receiver.position[2], batch, index, plane)
+                front = front_of(
+                    inputs.front_weights, planes.grids[plane], local_receiver.position[2], batch, index, plane
+                )
                 receiver.side_count = _with_side(planes, plane, False, front, local_receiver, receiver)
                 receiver.side_count = _with_side(planes, plane, True, 1.0 - front, local_receiver, receiver)
     return receiver
@@ -272,10 +276,10 @@ def prepare_receiver_adjoint(
     receiver: PlaneReceiver,
     inputs: PlaneInputs,
     adj_points: wp.array2d(dtype=wp.vec3),
-    adj_fronts: wp.array3d(dtype=wp.float32),
+    adj_front_weights: wp.array3d(dtype=wp.float32),
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
-    """Add to the gradients of points, fronts and frames."""
+    """Add to the gradients of points, front weights and frames."""
     batch, index = receiver.batch, receiver.index
     frame_batch = instance_in(batch, inputs.frames.shape[0])
     point, frames = inputs.points[batch, index], inputs.frames[frame_batch]
@@ -285,7 +289,9 @@ def prepare_receiver_adjoint(
         adj_local = _view_outline_adjoint(inputs.planes, side, receiver.edges, receiver.sides[i].adj_local_receiver)
         adj_front = wp.where(side.is_back, -1.0, 1.0) * receiver.sides[i].adj_weight
         height = side.local_receiver.position[2]
-        adj_height = front_of_adjoint(inputs.fronts, side.grid, height, adj_front, batch, index, side.plane, adj_fronts)
+        adj_height = front_of_adjoint(
+            inputs.front_weights, side.grid, height, adj_front, batch, index, side.plane, adj_front_weights
+        )
         adj_local.position = adj_local.position + wp.vec3(0.0, 0.0, adj_height)
         adj_point += find_local_receiver_adjoint(
             point, frames, side.plane, side.local_receiver, adj_local, frame_batch, adj_frames

@@ -276,9 +276,9 @@ def find_sample_receivers(
     if not device.is_capturing:
         owner_indices = np.flatnonzero(is_owner.numpy())
         if quadtree is not None:  # in tiles: light is found fastest where neighbors follow each other
-            positions = _positions_in_tiles(shape[1], width, TILE * supersampling)
+            tile_ranks = _ranks_in_tiles(shape[1], width, TILE * supersampling)
             view, sample = np.divmod(owner_indices, sample_count)
-            owner_indices = owner_indices[np.argsort(view * sample_count + positions[sample])]
+            owner_indices = owner_indices[np.argsort(view * sample_count + tile_ranks[sample])]
         ranks = body_ranks[sides.numpy().ravel()[owner_indices] % len(bodies)]
         owner_numbers, ends = _number_by_body(owner_indices // sample_count, ranks, view_count, len(body_ids))
         number_of_samples = np.empty(sides.size, np.int32)
@@ -350,8 +350,8 @@ def _body_ranks(
 
 
 @functools.lru_cache(maxsize=16)
-def _positions_in_tiles(height: int, width: int, tile: int) -> np.ndarray:
-    """Where each sample of an image comes, tile by tile."""
+def _ranks_in_tiles(height: int, width: int, tile: int) -> np.ndarray:
+    """Rank of each sample of an image, tile by tile."""
     row, column = np.divmod(np.arange(height * width), width)
     return np.argsort(np.lexsort((column // tile, row // tile)))
 

@@ -55,17 +55,17 @@ def _bound_clusters(
     run_bounds: wp.array2d(dtype=wp.vec4),
 ):
     """A thread owns a cluster, or a run: center and radius of a sphere around its spheres, below 0 for none."""
-    batch, thread = wp.tid()
+    batch, item = wp.tid()
     cluster_count = int(1)
-    run = thread
-    if thread >= cluster_bounds.shape[1]:
+    index = item
+    if item >= cluster_bounds.shape[1]:
         cluster_count = CLUSTERS_PER_RUN
-        run = thread - cluster_bounds.shape[1]
+        index = item - cluster_bounds.shape[1]
     lower = wp.vec3(wp.inf)
     upper = wp.vec3(-wp.inf)
     for k in range(cluster_count * NODES_PER_CLUSTER):
         node = find_node(
-            run * cluster_count + k // NODES_PER_CLUSTER, k % NODES_PER_CLUSTER, sphere_count, radii.shape[1]
+            index * cluster_count + k // NODES_PER_CLUSTER, k % NODES_PER_CLUSTER, sphere_count, radii.shape[1]
         )
         if node >= 0 and radii[batch, wp.max(node, 0)] > TINY_RADIUS:
             extent = wp.vec3(radii[batch, node])
@@ -75,17 +75,17 @@ def _bound_clusters(
     radius_of_bound = float(-1.0)
     for k in range(cluster_count * NODES_PER_CLUSTER):
         node = find_node(
-            run * cluster_count + k // NODES_PER_CLUSTER, k % NODES_PER_CLUSTER, sphere_count, radii.shape[1]
+            index * cluster_count + k // NODES_PER_CLUSTER, k % NODES_PER_CLUSTER, sphere_count, radii.shape[1]
         )
         if node >= 0 and radii[batch, wp.max(node, 0)] > TINY_RADIUS:
             radius_of_bound = wp.max(radius_of_bound, wp.length(centers[batch, node] - center) + radii[batch, node])
     if radius_of_bound < 0.0:
         center = wp.vec3(0.0)
     bound = wp.vec4(center[0], center[1], center[2], radius_of_bound)
-    if thread < cluster_bounds.shape[1]:
-        cluster_bounds[batch, run] = bound
+    if item < cluster_bounds.shape[1]:
+        cluster_bounds[batch, index] = bound
     else:
-        run_bounds[batch, run] = bound
+        run_bounds[batch, index] = bound
 
 
 class ClusterTree(NamedTuple):
