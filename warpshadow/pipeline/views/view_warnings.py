@@ -9,6 +9,7 @@ from warpshadow.pipeline.views.view import View
 from warpshadow.scene.body import Body
 from warpshadow.scene.creases import lined_surfaces, rounded_edges
 from warpshadow.scene.placement import enclosures, misplacements
+from warpshadow.scene.shell_light import blurred_shell
 
 
 def warn_of_view(view: View, cameras: Sequence[Camera] | None) -> bool:
@@ -20,6 +21,7 @@ def warn_of_view(view: View, cameras: Sequence[Camera] | None) -> bool:
     remarks, scene = [view.emptiness()], view.merged_scene.scene
     if cameras is not None:
         remarks += [*enclosures(scene, cameras), *misplacements(scene), *rounded_edges(scene), *lined_surfaces(scene)]
+        remarks += blurred_shell(scene)
     if result := [remark for remark in remarks if remark]:
         check.warn("; ".join(result))
     return bool(result)
