@@ -15,6 +15,7 @@ from warpshadow.inverse.uncertainty import NormalMatrix
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bounces import static_bounces
 from warpshadow.pipeline.methods.directional import Directional
+from warpshadow.pipeline.shading import lobe_light
 from warpshadow.pipeline.shading.lobe_light import LobeVisibility
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
@@ -163,6 +164,27 @@ def test_the_highlight_of_a_sun_is_that_of_many_samples_of_lobes(monkeypatch):
     many = ws.Renderer(SUNNY).render()[..., :3]
     # measured 2.1%; 16% where samples look for the sun, as many as there are
     assert np.linalg.norm(image - many) < 0.03 * np.linalg.norm(many)
+
+
+def test_explanations_look_for_no_suns_and_a_map_is_searched_once(monkeypatch):
+    find, maps = lobe_light.separate_suns, []
+    monkeypatch.setattr(lobe_light, "separate_suns", lambda radiance: maps.append(radiance) or find(radiance))
+    constant = ws.EnvironmentMap.constant(1.0)
+    renderer, other = ws.Renderer(dataclasses.replace(scene_of(), light=constant)), ws.synthetic_sky()
+    renderer.explain(light=other)
+    assert not maps
+    for _ in range(2):
+        renderer.draw(other)
+    assert len(maps) == 1
+
+
+@pytest.mark.parametrize("method", ["directional", "none", "ray-traced"])
+def test_light_without_suns_and_images_without_bodies_that_shine_are_drawn(method):
+    away = dataclasses.replace(BALL, translation=(0, 50, 0))
+    for body, light in ((BALL, ws.EnvironmentMap.constant(1.0)), (away, ws.synthetic_sky())):
+        scene = dataclasses.replace(scene_of(body, GROUND), light=light, visibility=ws.Visibility(method=method))
+        image = ws.render(scene)
+        assert np.isfinite(image).all() and image.any()
 
 
 def test_gradients_to_the_roughness_of_a_smooth_metal_under_a_sun_agree_with_differences():

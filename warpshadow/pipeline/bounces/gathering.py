@@ -168,43 +168,31 @@ class Gathering:
         # Cells look to where the light of the sky is, above horizons; light of planes is found around their middles. A
         # ball on a ground lost 4% of the ground's light by the former.
         middles = fibonacci(len(transmittance.directions))
-        arguments = (
-            fronts.lifted_points,
-            group.normals,
-            transmittance.transmittance_nonplanar,
-            outgoing.frames,
-            outgoing.texels,
-            planes.blockers,
-        )
+        arguments = fronts.lifted_points, group.normals, transmittance.transmittance_nonplanar, outgoing.frames
         options = {"coverages": transmittance.part_coverages, "front_weights": fronts.front_weights, "skip": skip}
-        return plane_light(*arguments, middles, **options)
+        return plane_light(*arguments, outgoing.texels, planes.blockers, middles, **options)
 
     def _from_spheres(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance
     ) -> wp.array | None:
         if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):
             return None
-        placed_proxies, proxy_radiance = outgoing.placed_proxies, outgoing.proxy_radiance
+        proxies, proxy_radiance = outgoing.placed_proxies, outgoing.proxy_radiance
         softness = self._visibility.softness
         if group.convex_parts_around is not None:
             softness = max(softness, _SOFTNESS_OF_PARTS)
-        count = common_batch({"geometry": group.points, "light": proxy_radiance, "proxies": placed_proxies.radii})
+        count = common_batch({"geometry": group.points, "light": proxy_radiance, "proxies": proxies.radii})
         points, normals = expand(group.points, count), expand(group.normals, count)
-        centers, radii = expand(placed_proxies.centers, count), expand(placed_proxies.radii, count)
+        spheres = expand(proxies.centers, count), expand(proxies.radii, count)
+        is_same = all(array is own for array, own in zip(spheres, (proxies.centers, proxies.radii), strict=True))
         return sphere_light(
-            points,
-            normals,
-            centers,
-            radii,
-            proxy_radiance,
+            *(points, normals, *spheres, proxy_radiance),
             expand_rows(transmittance.transmittance_nonplanar, count),
             transmittance.transmittance_self,
             transmittance.directions,
             softness=softness,
             merging=self._visibility.merging,
             skip=outgoing.proxies.span_of(group.body),
-            clusters=placed_proxies.clusters
-            if radii is placed_proxies.radii and centers is placed_proxies.centers
-            else None,
-            tangent_planes=placed_proxies.tangent_planes,
+            clusters=proxies.clusters if is_same else None,
+            tangent_planes=proxies.tangent_planes,
         )

@@ -151,23 +151,13 @@ class Group:
         parts = self.convex_parts_around or (None if own is None else own.parts)
         part_corners = None if parts is None else parts.placed_parts.corners
         arguments = points, normals, centers, radii = self.points, self.normals, self.centers, self.radii
+        others = {"rotations": rotation_data, "planes": frames, "positions": positions, "parts": part_corners}
         if radii.shape[1] or any(array is not None for array in (rotation_data, frames, part_corners)):
-            arrays = {
-                "points": points,
-                "centers": centers,
-                "radii": radii,
-                "rotations": rotation_data,
-                "planes": frames,
-            }
-            count = common_batch(arrays | {"positions": positions, "parts": part_corners})
+            count = common_batch({"points": points, "centers": centers, "radii": radii} | others)
             points, normals, centers, radii = [expand(array, count) for array in arguments]
             clusters = clusters if radii is self.radii and centers is self.centers else None
         size = points.shape[1]
-        if (
-            self.cached_rows is not None
-            or size <= RECEIVERS_AT_ONCE
-            or varies([*arguments, rotation_data, frames, part_corners, positions])
-        ):
+        if self.cached_rows is not None or size <= RECEIVERS_AT_ONCE or varies([*arguments, *others.values()]):
             yield replace(self, points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
             return
         for start in range(0, size, RECEIVERS_AT_ONCE):

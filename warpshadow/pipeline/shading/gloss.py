@@ -88,9 +88,8 @@ class GlossyPoints(LitPoints):
         roughness, light = values["roughness"], lobes.light
 
         def sample() -> Node:
-            spread = Node(
-                "", self._find_normal_spread, self.receivers_node, self.normals, self._clip_positions, self._fragments
-            )
+            seen = self.receivers_node, self.normals, self._clip_positions, self._fragments
+            spread = Node("", self._find_normal_spread, *seen)
             inputs = self.receivers_node, roughness, self._cameras, spread, self._fragments
             return Node("lobes", self._sample_lobes, *inputs, items=item_text)
 
@@ -111,16 +110,9 @@ class GlossyPoints(LitPoints):
         if materials.emission:
             highlights = self.method.highlights(self, materials, roughness, self._cameras)
             lobe_light = Node("", _add_highlights, lobe_light, highlights)
-        arguments = (
-            self._numbers,
-            diffuse,
-            field_of(lobe_light, "straight"),
-            field_of(lobe_light, "grazing"),
-            field_of(samples, "cosines"),
-            values["metallic"],
-            values["specular"],
-        )
-        mix = Node("reflection", mix_reflection, *arguments, items=item_text)
+        light_in_lobes = field_of(lobe_light, "straight"), field_of(lobe_light, "grazing")
+        of_surface = field_of(samples, "cosines"), values["metallic"], values["specular"]
+        mix = Node("reflection", mix_reflection, self._numbers, diffuse, *light_in_lobes, *of_surface, items=item_text)
         return field_of(mix, "colored"), field_of(mix, "white")
 
     def select(self, light: Node) -> Node:

@@ -78,18 +78,8 @@ class View(LitPoints):
         self._sample_count = counts[1] * self._size[0] * self._size[1]
         self._samples = f"{self._sample_count:,} samples"
         normals, receivers = self._wire(method, *self.dependencies)
-        super().__init__(
-            method.merged_scene,
-            materials,
-            vertices,
-            spheres,
-            receivers,
-            call,
-            static_bodies,
-            normals,
-            blocker_kinds,
-            is_scene_view,
-        )
+        lit = method.merged_scene, materials, vertices, spheres, receivers, call
+        super().__init__(*lit, static_bodies, normals, blocker_kinds, is_scene_view)
 
     def _wire(
         self,
@@ -113,17 +103,8 @@ class View(LitPoints):
             )
         fragments = Node("rasterization", rasterize, clip, faces, *self._size, items=samples)
         if two_sided.size:
-            vertices_and_cameras = detached(vertices), detached(cameras)
-            sides = Node(
-                "sides",
-                find_sides,
-                fragments,
-                faces,
-                two_sided,
-                *vertices_and_cameras,
-                items=samples,
-                has_adjoint=False,
-            )
+            side_inputs = fragments, faces, two_sided, detached(vertices), detached(cameras)
+            sides = Node("sides", find_sides, *side_inputs, items=samples, has_adjoint=False)
         else:
             sides = Node("sides", identity, fragments, idle="every body is closed: none is seen from behind")
         edge_inputs = merged_scene.edges, clip, merged_scene.face_bodies, merged_scene.creases
