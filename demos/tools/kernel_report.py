@@ -65,8 +65,8 @@ BUDGETS = {
     "warpshadow.stages.planes.coverage": {"find_coverage": Budget(112), "find_coverage_adjoint": Budget(200)},
     "warpshadow.stages.bounces.plane_light": {"light_receivers": Budget(160), "light_receivers_adjoint": Budget(200)},
 }
-"""Of kernels of visibility on sm_90, by the name of a factory's kernel, or of a file and its kernels: tests hold them
-to these, for one architecture, as compiling takes long. Budgets of sm_75 and sm_80 were the same."""
+"""Of kernels of visibility, by the name of a factory's kernel, or of a file and its kernels, which tests compile for
+sm_90 alone."""
 
 
 class Resources(NamedTuple):

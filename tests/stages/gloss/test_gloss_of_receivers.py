@@ -106,36 +106,45 @@ def test_samples_of_lobes_have_the_gradients_of_the_twin(device, count, is_turne
         assert abs((gradient * towards).sum() - (loss(moved[0]) - loss(moved[1])) / (2 * step)) < 20 * FLOAT32 * scale
 
 
-def test_normals_vary_over_a_pixel_as_they_do_between_pixels(device):
-    """On one large face of a ball's curvature, seen at a slant: against differences of the interpolated normals."""
-    positions = np.array([[-1.0, -0.8, 0.1], [1.1, -0.7, -0.4], [0.1, 0.9, 0.3]])
-    corner_normals = twins.unit(positions * [0.4, 0.4, 0] + [0, 0, 1])
-    matrix, size = CAMERA, 16
-    clip = np.column_stack([positions, np.ones(3)]) @ matrix.T
+@pytest.mark.parametrize(("tilt", "is_smooth"), [(0.1, True), (0.9, False)])
+def test_normals_vary_over_a_pixel_as_they_do_between_pixels(device, tilt, is_smooth):
+    """On one large face, seen in the plane across the normal, or of the face where the normal is far from its own."""
+    positions, size = np.array([[-1.0, -0.8, 0.1], [1.1, -0.7, -0.4], [0.1, 0.9, 0.3]]), 16
+    face_normal = twins.unit(np.cross(positions[1] - positions[0], positions[2] - positions[0]))
+    corner_normals = twins.unit(0.1 * positions + face_normal + tilt * np.array([0.5, -0.8, 0.0]))
+    weights, eye = np.array([0.3, 0.3, 0.4]), twins.eye_of(CAMERA)
+    point, normal = weights @ positions, twins.unit(weights @ corner_normals)
+    plane_normal = normal if is_smooth else face_normal
+    assert (normal @ face_normal > 0.96) == is_smooth and (normal @ face_normal > 0.9) == is_smooth
+    clip = CAMERA @ [*point, 1]
 
-    def fragment(x, y):
-        """Barycentrics of a position in the image, from −1 to 1."""
-        rows = np.stack([clip[:, 0] - x * clip[:, 3], clip[:, 1] - y * clip[:, 3], np.ones(3)])
-        return np.linalg.solve(rows, [0, 0, 1])
+    def normal_at(x, y):
+        """Of the point of the plane at a position in the image, from −1 to 1, moved onto the face along its normal."""
+        rows = np.stack([CAMERA[0, :3] - x * CAMERA[3, :3], CAMERA[1, :3] - y * CAMERA[3, :3], plane_normal])
+        seen = np.linalg.solve(rows, [*(np.array([x, y]) * CAMERA[3, 3] - CAMERA[:2, 3]), plane_normal @ point])
+        barycentrics = np.linalg.solve(np.vstack([positions.T, np.ones(3)])[[0, 1, 3]], [*_onto(seen)[:2], 1])
+        return twins.unit(barycentrics @ corner_normals)
 
-    def normal(x, y):
-        return twins.unit(fragment(x, y) @ corner_normals)
+    def _onto(seen):
+        return seen - (seen - point) @ face_normal * face_normal
 
-    middle, step = np.array([0.1, -0.05]), 1e-4
-    variables = [
+    arrays_of = [
         wp.array(np.array(value)[None].astype(np.float32), dtype=dtype, device=device)
-        for value, dtype in ((corner_normals, wp.vec3), (clip, wp.vec4))
+        for value, dtype in ((corner_normals, wp.vec3), (positions, wp.vec3), (CAMERA, wp.mat44))
     ]
     fragments = Fragments(
         wp.zeros((1, 1), dtype=wp.int32, device=device),
-        wp.array(fragment(*middle)[None, None].astype(np.float32), dtype=wp.vec3, device=device),
+        wp.array(weights[None, None].astype(np.float32), dtype=wp.vec3, device=device),
     )
     faces = wp.array([[0, 1, 2]], dtype=wp.vec3i, device=device)
-    got = find_normal_spread(fragments, faces, *variables, (size, size), 2)
+    got = find_normal_spread(fragments, faces, *arrays_of, (size, size), 2)
+    slant = abs(plane_normal @ twins.unit(eye - point))
+    middle, step = clip[:2] / clip[3], 1e-4
     for result, axis in zip(got, np.eye(2), strict=True):
-        change = normal(*(middle + step * axis)) - normal(*(middle - step * axis))
-        expected = change / (2 * step) * 2 / size
-        assert np.abs(result.numpy()[0, 0] - expected).max() < 1e-3 * np.abs(expected).max()
+        change = normal_at(*(middle + step * axis)) - normal_at(*(middle - step * axis))
+        expected = change / (2 * step) * 2 / size * slant / np.hypot(slant, 0.1)
+        found = result.numpy()[0, 0]
+        assert min(np.abs(found - expected).max(), np.abs(found + expected).max()) < 3e-3 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])

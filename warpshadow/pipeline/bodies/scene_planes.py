@@ -61,7 +61,7 @@ class ScenePlanes:
     def half_spaces(self, number: int) -> np.ndarray:
         """Planes (n, d) of the other flat bodies, in a body's frame, n·x + d > 0 on the side from which they are seen.
 
-        That is where most of the other bodies and the camera are; a plane that has as many on both sides is left out.
+        That is where the bodies that are not flat and the camera are; a plane that has some on both sides is left out.
         """
         scene, result = self._merged_scene.scene, []
         solids = [body.world_points().mean(axis=0) for n, body in enumerate(scene.bodies) if n not in self.numbers]
@@ -70,9 +70,9 @@ class ScenePlanes:
             points = scene.bodies[other].world_points()
             normal = principal_axes(points)[2]
             heights = (viewers - points[0]) @ normal
-            side = np.sign(heights[np.abs(heights) > _ROUNDING * np.ptp(points, axis=0).max()]).sum()
-            if other != number and side:
-                normal = np.sign(side) * normal @ body.rotation_matrix()
+            sides = np.unique(np.sign(heights[np.abs(heights) > _ROUNDING * np.ptp(points, axis=0).max()]))
+            if other != number and len(sides) == 1:
+                normal = sides[0] * normal @ body.rotation_matrix()
                 result.append([*normal, -normal @ body.from_world(points[0])])
         return np.array(result).reshape(-1, 4)
 

@@ -88,8 +88,8 @@ class GlossyPoints(LitPoints):
         roughness, light = values["roughness"], lobes.light
 
         def sample() -> Node:
-            seen = self.receivers_node, self.normals, self._clip_positions, self._fragments
-            spread = Node("", self._find_normal_spread, *seen)
+            geometry = self.normals, self.vertices, self._cameras
+            spread = Node("", self._find_normal_spread, self.receivers_node, *geometry, self._fragments)
             inputs = self.receivers_node, roughness, self._cameras, spread, self._fragments
             return Node("lobes", self._sample_lobes, *inputs, items=item_text)
 
@@ -142,7 +142,7 @@ class GlossyPoints(LitPoints):
         return rows(interpolate(fragments, self.merged_scene.side_faces, values))
 
     def _find_normal_spread(
-        self, receivers: Receivers, normals: wp.array, clip_positions: wp.array, seen: Fragments
+        self, receivers: Receivers, normals: wp.array, positions: wp.array, cameras: wp.array, seen: Fragments
     ) -> NormalSpread:
         """Find how normals vary over the receivers. Differentiable: all but seen."""
         # samples of a receiver, across
@@ -150,7 +150,8 @@ class GlossyPoints(LitPoints):
         _, height, width = seen.face_ids.shape
         fragments, size = receivers.sample_fragments, (width // sharing, height // sharing)
         assert fragments is not None
-        return find_normal_spread(fragments, self.merged_scene.side_faces, normals, clip_positions, size, sharing)
+        arguments = fragments, self.merged_scene.side_faces, normals, positions, cameras
+        return find_normal_spread(*arguments, size, sharing)
 
     def _sample_lobes(
         self, receivers: Receivers, roughness: wp.array, cameras: wp.array, spread: NormalSpread, seen: Fragments
