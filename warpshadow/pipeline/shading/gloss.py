@@ -157,11 +157,11 @@ class GlossyPoints(LitPoints):
         self, receivers: Receivers, roughness: wp.array, cameras: wp.array, spread: NormalSpread, seen: Fragments
     ) -> LobeSamples:
         """Samples of the lobes of the receivers. Differentiable: all but seen."""
-        places, across = None, self.method.lobes.receivers_across
-        if across > 1 and receivers.samples is not None:
-            places = places_in_pixels(receivers.samples, seen.face_ids.shape[2], across)
+        places, receivers_across = None, self.method.lobes.receivers_across
+        if receivers_across > 1 and receivers.samples is not None:
+            places = places_in_pixels(receivers.samples, seen.face_ids.shape[2], receivers_across)
         arguments = receivers.points, receivers.normals, roughness, cameras, self.method.lobes.samples_of_receiver
-        return sample_lobes(*arguments, spread, places, across**2)
+        return sample_lobes(*arguments, spread, places, receivers_across**2)
 
     def _sample_textures(
         self, fragments: Fragments, values: wp.array, textures: Textures, footprints: Footprints

@@ -39,7 +39,7 @@ class LobeVisibility:
 
     | member | needed for | default |
     | --- | --- | --- |
-    | :meth:`transmittance` | shadows in what bodies mirror | 1: no shadows |
+    | :meth:`transmittance` | shadows in mirrored light | 1: no shadows |
     | :meth:`sun_transmittance` | suns | :meth:`transmittance` in :attr:`sun_sample_count` directions of each |
     | :meth:`blocked_radiance` | light that bounces | refused |
 

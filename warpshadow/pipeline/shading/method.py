@@ -48,7 +48,7 @@ class Method(abc.ABC):
     | :meth:`transfers` | free light | – |
     | :meth:`emitted_light` | lamps | – |
     | :meth:`highlights` | lamps, on bodies that shine | – |
-    | :attr:`lobes` | bodies that shine | no shadows in what they mirror |
+    | :attr:`lobes` | bodies that shine | no shadows in mirrored light |
     | :meth:`openness` | light that bounces between static patches | None: rays find it, as they find form factors |
     | :meth:`along_paths` | light that bounces along paths (:func:`.choose_bouncing`) | refused |
     | :meth:`blocker_kinds` | planes, convex parts, traced self-visibility | spheres alone |
