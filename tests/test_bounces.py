@@ -663,17 +663,3 @@ def test_two_threads_at_once_find_the_images_and_gradients_that_one_finds(method
         assert all(map(torch.equal, one[:3], other[:3]))
         torch.testing.assert_close(one[3], other[3], rtol=1e-4, atol=1e-4 * float(other[3].abs().max()))
     assert not torch.equal(expected[0][0], expected[1][0])
-
-
-@pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render()])
-def test_foot_of_a_wall_is_as_bright_whatever_stands_elsewhere(render):
-    """Texels of the ground are large far from bodies, and lie partly behind the wall, where it is dark."""
-    wall = ws.Body(ws.plane((6.0, 4.0), 8), (0.8,) * 3, translation=(0, 2, -1), rotation=(90, 0, 0), name="wall")
-    ground = ws.Body(ws.plane(6.0, 16), (0.6,) * 3, name="ground")
-    ball = ws.Body(ws.icosphere(0.2, 2), (0.6,) * 3, translation=(1.5, 0.3, 1.5), name="ball")
-    camera = ws.Camera.look_at((-1.8, 0.5, 0.5), (-1.8, 0.1, -1), fov_y=30, size=(24, 24))
-    light = ws.synthetic_sky((0, 0.7, 0.8), height=16)
-    alone, beside = (
-        render(ws.Scene(bodies, light, camera, bounces=1))[..., 0] for bodies in ([wall, ground], [wall, ground, ball])
-    )
-    np.testing.assert_allclose(beside.mean(axis=1), alone.mean(axis=1), rtol=0.02)
