@@ -245,6 +245,15 @@ def find_plane_patches(
     piece_mesh = _cut_faces(positions, faces, to_texels)
     labels = grid.texels_of((piece_mesh.centroids - origin) @ frame.T[:, :2])
     centers = origin + grid.middles().reshape(-1, 2) @ frame[:2]
+    is_shown = grid.shown.ravel() == 1
+    if (
+        half_spaces is not None and not is_shown.all()
+    ):  # a piece that reaches out from behind a plane has light before it
+        heights = piece_mesh.pieces.positions(positions, faces) @ half_spaces[:, :3].T + half_spaces[:, 3]
+        reaches_out = (heights > _LIFT * np.ptp(heights, axis=(0, 1))).all(axis=2).any(axis=1) & ~is_shown[labels]
+        shown_texels = np.flatnonzero(is_shown & (grid.covered.ravel() > 0))
+        nearest = _nearest_center(centers[shown_texels], piece_mesh.centroids[reaches_out])
+        labels[reaches_out] = shown_texels[nearest]
     areas = grid.covered.ravel() * texel_sizes.prod(axis=1)
     return Patches(
         *_repeat_on_sides(grid.sides, areas, centers, np.tile(frame[2], (len(areas), 1))),

@@ -19,7 +19,7 @@ _WHOLE = 1e-4  # share of its rectangle up to which gaps of a mesh do not count
 _HIDDEN_WEIGHT = 1e-5  # of a texel that another plane hides; much less than the weight of texels in their neighbors …
 _MAX_HIDING = 5  # … for each of so many planes, so that products do not underflow
 # points along each side of a texel that are tested to lie on the mesh; odd, so that its middle is one
-_TESTS_PER_SIDE = 7
+_TESTS_PER_SIDE = 3
 
 
 class PlaneTexture(NamedTuple):
