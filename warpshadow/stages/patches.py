@@ -223,15 +223,18 @@ def find_plane_patches(
     is_two_sided: bool,
     others: np.ndarray | None = None,
     contact: Contact | None = None,
+    walls: np.ndarray | None = None,
 ) -> Patches:
     """Find the patches of a body that lies in a plane: the texels of a grid over its smallest rectangle.
 
     Args:
-        positions, faces, is_two_sided, others, contact: As for :func:`warpshadow.stages.planes.grid.find_grid`.
+        positions, faces, is_two_sided, others, contact, walls: As for :func:`warpshadow.stages.planes.grid.find_grid`.
     Returns:
         Patches, row by row: texels off the mesh have no area and no patch sample.
     """
-    grid, texel_points = find_grid(positions, faces, is_two_sided=is_two_sided, others=others, contact=contact)
+    grid, texel_points = find_grid(
+        positions, faces, is_two_sided=is_two_sided, others=others, contact=contact, walls=walls
+    )
     frame, origin = grid.frame, grid.origin
     texel_sizes = grid.texel_sizes().reshape(-1, 2)
 
@@ -242,6 +245,13 @@ def find_plane_patches(
     piece_mesh = _cut_faces(positions, faces, to_texels)
     labels = grid.texels_of((piece_mesh.centroids - origin) @ frame.T[:, :2])
     centers = origin + grid.middles().reshape(-1, 2) @ frame[:2]
+    if walls is not None and len(walls):  # a piece that reaches out from behind a wall has the light before it
+        heights = piece_mesh.pieces.positions(positions, faces) @ walls[:, :3].T + walls[:, 3]
+        reaches_out = (heights > _LIFT * np.ptp(heights, axis=(0, 1))).all(axis=2).any(axis=1)
+        reaches_out &= grid.weights.ravel()[labels] < 1
+        before = np.flatnonzero((grid.weights.ravel() == 1) & (grid.covered.ravel() > 0))
+        if len(before):
+            labels[reaches_out] = before[_nearest_center(centers[before], piece_mesh.centroids[reaches_out])]
     areas = grid.covered.ravel() * texel_sizes.prod(axis=1)
     return Patches(
         *_repeat_on_sides(grid.sides, areas, centers, np.tile(frame[2], (len(areas), 1))),

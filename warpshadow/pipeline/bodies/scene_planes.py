@@ -13,11 +13,14 @@ import numpy as np
 import warp as wp
 
 from warpshadow.maths.directions import fibonacci
+from warpshadow.maths.plane import principal_axes
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.stages.planes.grid import find_grid
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
+_MAX_WALL_COSINE = 0.9  # between the normals of a wall and of the plane that it stands on
+_MAX_WALL_GAP = 0.02  # between both, in units of the wall's height
 _CORNERS = 64  # directions in which the vertices of a body are sought that are farthest out
 
 
@@ -55,6 +58,28 @@ class ScenePlanes:
         """Vertices of each other body where the scene has it, in a body's frame."""
         bodies = self._merged_scene.scene.bodies
         return [bodies[number].from_world(body.world_points()) for other, body in enumerate(bodies) if other != number]
+
+    def walls(self, number: int) -> np.ndarray:
+        """Planes of flat bodies that stand on a flat body, where the scene has nothing else behind them.
+
+        Returns:
+            n, d in the body's frame, n·x + d > 0 before each, float64 of shape [wall, 4].
+        """
+        bodies, walls = self._merged_scene.scene.bodies, [np.empty((0, 4))]
+        own_normal = principal_axes(bodies[number].mesh.world_points().astype(np.float64))[2]
+        origin = bodies[number].mesh.world_points()[0]
+        points = dict(zip(np.delete(np.arange(len(bodies)), number), self.others(number), strict=True))
+        solid = [points[other] for other in points if other not in self.numbers]
+        for other in points if solid else ():
+            normal, heights = principal_axes(points[other])[2], (points[other] - origin) @ own_normal
+            gap = _MAX_WALL_GAP * np.ptp(heights)
+            stands = other in self.numbers and abs(normal @ own_normal) < _MAX_WALL_COSINE
+            if stands and bodies[other].casts_shadow and heights.min() <= gap and heights.max() >= -gap:
+                offsets = (np.concatenate(solid) - points[other][0]) @ normal
+                if offsets.min() >= 0 or offsets.max() <= 0:
+                    normal = normal if offsets.min() >= 0 else -normal
+                    walls.append(np.append(normal, -normal @ points[other][0])[None])
+        return np.concatenate(walls)
 
     def blockers(self, bodies: tuple[int, ...], blocking_bodies: tuple[int, ...]) -> PlaneBlockers:
         """Plane blockers of some flat bodies, which send no light; ``blocking_bodies`` cast shadows."""

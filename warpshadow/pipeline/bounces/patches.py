@@ -84,7 +84,11 @@ class ScenePatches:
                 is_two_sided = is_two_sided and (not others or bool(min(map(np.mean, heights)) < 0))
                 points = np.concatenate(others) if others else None
                 self._of_body[number] = find_plane_patches(
-                    *corners, is_two_sided=is_two_sided, others=points, contact=self._contact_of_grid(number)
+                    *corners,
+                    is_two_sided=is_two_sided,
+                    others=points,
+                    contact=self._contact_of_grid(number),
+                    walls=self._scene_planes.walls(number),
                 )
             else:
                 counts = self._counts

@@ -15,6 +15,7 @@ _GRID_OF_CONTACT = 28  # … and of a grid around a contact
 _CONTACT_SPREAD = 0.05  # within how far of a contact texels are about even, in units of its size
 _EVEN_SPREAD = 100.0  # spread of a grid that is even, in sizes of its body
 _ROUNDING = 1e-6  # how far off a face a point may lie and still count as on it, as a part of the face or texel
+_BEHIND = 1e-4  # weight of texels behind a wall: less than that of texels beside others
 _WHOLE = 1e-4  # share of its rectangle up to which gaps of a mesh do not count
 # points along each side of a texel that are tested to lie on the mesh; odd, so that its middle is one
 _TESTS_PER_SIDE = 3
@@ -36,6 +37,7 @@ class PlaneTexture(NamedTuple):
     low: np.ndarray
     high: np.ndarray  # corners of the rectangle in (ξ, η), float64 of shape [2]
     covered: np.ndarray  # share of each texel that the mesh covers, float32 of shape [row, column]
+    weights: np.ndarray  # how much the light of each counts in those beside it: less behind walls, of the same shape
     sides: int  # 1 if the front alone sends light, 2 if the back does, too; its patches follow the front's
     outline: np.ndarray  # edges (a, b) around the mesh and its holes, the mesh to their left, float64 [edge, 2, 2]
 
@@ -120,6 +122,7 @@ def find_grid(
     is_two_sided: bool,
     others: np.ndarray | None = None,
     contact: Contact | None = None,
+    walls: np.ndarray | None = None,
 ) -> tuple[PlaneTexture, CoveredPoints]:
     """Find the grid of a body that lies in a plane, over its smallest rectangle.
 
@@ -130,6 +133,7 @@ def find_grid(
         others: Points of the scene's other bodies, in this body's frame, shape [point, 3]: texels are small near them.
             None for an even grid.
         contact: Where another body touches this one, in its frame, if texels are to be smallest there.
+        walls: Walls that stand on this body, nothing behind them: n, d of shape [wall, 4], n·x + d > 0 before them.
     Returns:
         The grid, and a point in each texel of which the mesh covers some.
     Raises:
@@ -161,9 +165,12 @@ def find_grid(
     vertices_in_plane = (positions[unique_vertices].astype(np.float64) - origin) @ frame[:2].T
     outline = vertices_in_plane[find_outline(vertices_in_plane, vertex_index.reshape(-1)[faces])]
     full_coverage = np.ones((height, width), np.float32)
-    grid = PlaneTexture(frame, origin, float(spread), low, high, full_coverage, sides, outline)
-    covered, covered_points = _find_covered(grid, corners)
-    return grid._replace(covered=covered), covered_points
+    grid = PlaneTexture(frame, origin, float(spread), low, high, full_coverage, full_coverage, sides, outline)
+    tests = origin + grid.points(_TESTS_PER_SIDE) @ frame[:2]
+    walls = np.empty((0, 4)) if walls is None else walls
+    is_before = (tests @ walls[:, :3].T + walls[:, 3] > 0).all(axis=2)
+    covered, weights, covered_points = _find_covered(grid, corners, is_before)
+    return grid._replace(covered=covered, weights=weights), covered_points
 
 
 def _smallest_rectangle(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -183,8 +190,13 @@ def _smallest_rectangle(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return np.stack([edges[smallest] @ basis, normals_of_edges[smallest] @ basis, normal])
 
 
-def _find_covered(grid: PlaneTexture, corners: np.ndarray) -> tuple[np.ndarray, CoveredPoints]:
-    """Find which share of each texel the faces [face, 3, 2] cover, and a point in each that is not empty."""
+def _find_covered(
+    grid: PlaneTexture, corners: np.ndarray, is_before: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, CoveredPoints]:
+    """Find which share of each texel the faces [face, 3, 2] cover, its weight, and a point in each that is not empty.
+
+    The point lies before all walls if one of the points that are tested does, as ``is_before`` says of these.
+    """
     height, width = grid.covered.shape
     points = grid.points(_TESTS_PER_SIDE)
     shape = np.array([width, height]) * _TESTS_PER_SIDE
@@ -202,18 +214,21 @@ def _find_covered(grid: PlaneTexture, corners: np.ndarray) -> tuple[np.ndarray, 
     is_inside = (barycentrics > -_ROUNDING).all(axis=1)
     owners = np.full(points.shape[:2], -1)
     owners[row[is_inside], column[is_inside]] = np.flatnonzero(is_inside)
-    tested_points = (
-        owners.reshape(height, _TESTS_PER_SIDE, width, _TESTS_PER_SIDE).swapaxes(1, 2).reshape(height * width, -1)
+    tested_points, is_before = (
+        item.reshape(height, _TESTS_PER_SIDE, width, _TESTS_PER_SIDE).swapaxes(1, 2).reshape(height * width, -1)
+        for item in (owners, is_before)
     )
     covered = (tested_points >= 0).mean(axis=1)
     by_centrality = np.abs(np.arange(_TESTS_PER_SIDE**2) - _TESTS_PER_SIDE**2 // 2).argsort(kind="stable")
-    nearest_test = (tested_points[:, by_centrality] >= 0).argmax(axis=1)
+    preference = (tested_points >= 0) * (1 + is_before)
+    weights = np.where(preference.max(axis=1) == 2, 1.0, _BEHIND).reshape(height, width)
+    nearest_test = preference[:, by_centrality].argmax(axis=1)
     chosen_owners = tested_points[np.arange(len(tested_points)), by_centrality[nearest_test]]
     texels = np.flatnonzero(chosen_owners >= 0)
     covered_points = CoveredPoints(
         faces[chosen_owners[texels]], np.maximum(barycentrics[chosen_owners[texels]], 0), texels
     )
-    return covered.reshape(height, width).astype(np.float32), covered_points
+    return covered.reshape(height, width).astype(np.float32), weights.astype(np.float32), covered_points
 
 
 def _barycentrics(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -71,7 +71,7 @@ class PlaneBlockers:
         edges: Begin and end of the edges of outlines, in the axes of their planes, vec4 of shape [edge].
         edge_axes: Unit vectors along them, vec2 of shape [edge].
         texels_of_patches: Part of the area of each texel that patches have, and a little in the texels beside it,
-            [texel, patch]; None where no patches are given.
+            less behind walls, [texel, patch]; None where no patches are given.
         frames_of_vertices: Matrix that finds frames, [3 · plane, vertex].
         has_holes: Whether a mesh of the plane blockers leaves a part of its rectangle open, as a window.
     """
@@ -111,9 +111,8 @@ class PlaneBlockers:
                     covered.append(matrix @ grid.covered.ravel())
                     if patch_count:
                         first = body.first_patch + side * grid.covered.size
-                        pyramids.append(
-                            _shifted(level_matrix.multiply(grid.covered.ravel()).tocsr(), first, patch_count)
-                        )
+                        weighted_matrix = level_matrix.multiply((grid.covered * grid.weights).ravel()).tocsr()
+                        pyramids.append(_shifted(weighted_matrix, first, patch_count))
             grids.append(_kernel_grid(body, first_level, len(matrices), first_edge, edges[-1]))
             grids[-1].is_covered_by_texels = int(not is_exact)
             frames.append(_frame_matrix(body, vertex_count))
