@@ -73,8 +73,8 @@ class ScenePlanes:
         for other in points if solid else ():
             normal, heights = principal_axes(points[other])[2], (points[other] - origin) @ own_normal
             gap = _MAX_WALL_GAP * np.ptp(heights)
-            stands = other in self.numbers and abs(normal @ own_normal) < _MAX_WALL_COSINE
-            if stands and bodies[other].casts_shadow and heights.min() <= gap and heights.max() >= -gap:
+            is_wall = other in self.numbers and abs(normal @ own_normal) < _MAX_WALL_COSINE
+            if is_wall and bodies[other].casts_shadow and heights.min() <= gap and heights.max() >= -gap:
                 offsets = (np.concatenate(solid) - points[other][0]) @ normal
                 if offsets.min() >= 0 or offsets.max() <= 0:
                     normal = normal if offsets.min() >= 0 else -normal
