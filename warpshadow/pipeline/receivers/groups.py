@@ -98,6 +98,7 @@ class Group:
     nearest_blockers: NearestBlockers | None = None  # None where receivers are not patch samples
     skip: tuple[int, int] = (0, 0)  # spheres that do not block: the first, and the one after the last
     clusters: ClusterTree | None = None  # of the spheres, where they are found already
+    footprints: wp.array | None = None  # [batch, receiver] vec3, areas for which they stand; None for points
 
     @property
     def is_blocked_by_planes(self) -> bool:
@@ -151,6 +152,7 @@ class Group:
         parts = self.convex_parts_around or (None if own is None else own.parts)
         part_corners = None if parts is None else parts.placed_parts.corners
         arguments = points, normals, centers, radii = self.points, self.normals, self.centers, self.radii
+        footprints = self.footprints
         if radii.shape[1] or any(array is not None for array in (rotation_data, frames, part_corners)):
             arrays = {
                 "points": points,
@@ -161,6 +163,7 @@ class Group:
             }
             count = common_batch(arrays | {"positions": positions, "parts": part_corners})
             points, normals, centers, radii = [expand(array, count) for array in arguments]
+            footprints = None if footprints is None else expand(footprints, count)
             clusters = clusters if radii is self.radii and centers is self.centers else None
         size = points.shape[1]
         if (
@@ -168,7 +171,14 @@ class Group:
             or size <= RECEIVERS_AT_ONCE
             or varies([*arguments, rotation_data, frames, part_corners, positions])
         ):
-            yield replace(self, points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
+            arrays = {
+                "points": points,
+                "normals": normals,
+                "centers": centers,
+                "radii": radii,
+                "footprints": footprints,
+            }
+            yield replace(self, **arrays, clusters=clusters)
             return
         for start in range(0, size, RECEIVERS_AT_ONCE):
             portion = slice(start, min(start + RECEIVERS_AT_ONCE, size))
@@ -179,6 +189,7 @@ class Group:
                 centers=centers,
                 radii=radii,
                 own=None if own is None else own.cut(portion),
+                footprints=None if footprints is None else footprints[:, portion].contiguous(),
                 nearest_blockers=None if self.nearest_blockers is None else self.nearest_blockers.cut(portion),
                 clusters=clusters,
             )
@@ -263,10 +274,11 @@ class Blockers(NamedTuple):
             return None
         return GroupConvexParts(self.parts.blockers(bodies, (body,)), self.placed_parts, on_surface=True)
 
-    def around_plane(self, points: wp.array, normals: wp.array, body: int) -> Group:
+    def around_plane(self, points: wp.array, normals: wp.array, footprints: wp.array, body: int) -> Group:
         """The group of points of a flat body."""
         planes, parts = self.planes_around(body), self.convex_parts_around()
-        return Group(points, normals, *self.spheres_of(self.bodies), planes=planes, convex_parts_around=parts)
+        spheres = self.spheres_of(self.bodies)
+        return Group(points, normals, *spheres, planes=planes, convex_parts_around=parts, footprints=footprints)
 
 
 def _blocking(
@@ -316,8 +328,9 @@ def _groups_that_move(
     spheres, none = blockers.spheres_of(sphere_bodies), blockers.spheres_of([])
     clusters, nearest_blockers = None, _nearest_blockers(nearest_spheres, blockers)
     if not receivers.spans:
-        points_and_normals = receivers.points, receivers.normals
-        yield Group(*points_and_normals, *spheres, planes=blockers.planes_around(), nearest_blockers=nearest_blockers)
+        points_and_normals, planes = (receivers.points, receivers.normals), blockers.planes_around()
+        group = Group(*points_and_normals, *spheres, planes=planes, nearest_blockers=nearest_blockers)
+        yield replace(group, footprints=receivers.footprints)
     for span in receivers.spans:
         points_and_normals = receivers.points, receivers.normals
         assert receivers.vertices is not None
@@ -330,6 +343,8 @@ def _groups_that_move(
         points, normals = (cut(array, span.first, span.end) for array in points_and_normals)
         planes, parts = blockers.planes_around(span.body), blockers.convex_parts_around(span.body)
         group = Group(points, normals, *others, planes=planes, convex_parts_around=parts)
+        if receivers.footprints is not None and not is_at_vertices:
+            group = replace(group, footprints=cut(receivers.footprints, span.first, span.end))
         if others is spheres:
             clusters = clusters or find_clusters(*spheres, blockers.merging)
             group = replace(group, skip=skip, clusters=clusters)
