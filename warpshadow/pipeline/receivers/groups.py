@@ -171,14 +171,8 @@ class Group:
             or size <= RECEIVERS_AT_ONCE
             or varies([*arguments, rotation_data, frames, part_corners, positions])
         ):
-            arrays = {
-                "points": points,
-                "normals": normals,
-                "centers": centers,
-                "radii": radii,
-                "footprints": footprints,
-            }
-            yield replace(self, **arrays, clusters=clusters)
+            spheres = {"centers": centers, "radii": radii, "clusters": clusters}
+            yield replace(self, points=points, normals=normals, footprints=footprints, **spheres)
             return
         for start in range(0, size, RECEIVERS_AT_ONCE):
             portion = slice(start, min(start + RECEIVERS_AT_ONCE, size))

@@ -1,7 +1,7 @@
 """Footprints: the areas for which receivers at samples stand, a pixel of their plane or a sample of it.
 
-An edge of a shadow that is narrower than a footprint is seen at few receivers, and its motion by none between. Edges are
-so wide that each receiver has about the mean over its footprint (:mod:`warpshadow.stages.visibility.directional`).
+An edge of a shadow that is narrower than a footprint is seen at few receivers, and its motion by none between. So edges
+are wide enough that each receiver has about the mean over its footprint (:mod:`.visibility.directional`).
 """
 
 import numpy as np
