@@ -54,6 +54,7 @@ from warpshadow.stages.silhouettes.lines import (
     NOTHING,
     FragmentArrays,
     edge_line,
+    edge_position_adjoint,
     line_between,
     make_fragment_arrays,
 )
@@ -237,6 +238,7 @@ def _add_shading_gradients(
                         is_flat = is_flat and fragments.face_ids[neighbor(fragment, direction, width)] == face
                 weighted_slopes = wp.vec2()
                 distances = wp.vec2()  # lengths over which the differences were measured [samples]
+                edge_steps = wp.vec4()
                 if not is_flat:
                     for direction in range(4):
                         edge = wp.vec2i(NOTHING, NOTHING)
@@ -250,7 +252,7 @@ def _add_shading_gradients(
                                 # own colors
                                 color_step = edge_colors[batch - fragment_batch, entry, direction] - color
                                 adj_step = wp.dot(adj_color, wp.vec3(color_step[0], color_step[1], color_step[2]))
-                                weighted_slopes[direction / 2] += direction_sign(direction) * adj_step
+                                edge_steps[direction] = direction_sign(direction) * adj_step
                                 distances[direction / 2] += t
                         elif edge[0] == NOTHING and has_neighbor(fragment, direction, width, fragments.height):
                             neighbor_sample = neighbor(sample, direction, width)
@@ -258,6 +260,16 @@ def _add_shading_gradients(
                                 light_step = wp.dot(adj_light, light[light_batch, neighbor_sample] - sample_light)
                                 weighted_slopes[direction / 2] += direction_sign(direction) * 0.5 * light_step
                                 distances[direction / 2] += 0.5
+                if wp.length_sq(edge_steps) > 0.0:
+                    for direction in range(4):
+                        if edge_steps[direction] != 0.0:
+                            edge_slope = edge_steps[direction] / distances[direction / 2]
+                            adj_position = -edge_slope * samples_per_unit[direction / 2]
+                            edge = edges[entry, direction]
+                            adj_a, adj_b = edge_position_adjoint(edge, center, direction / 2, adj_position, clip)
+                            if wp.isfinite(adj_a) and wp.isfinite(adj_b):
+                                wp.atomic_add(adj_clip_positions, fragment_batch, edge[0], adj_a)
+                                wp.atomic_add(adj_clip_positions, fragment_batch, edge[1], adj_b)
                 slope = wp.cw_mul(wp.cw_div(weighted_slopes, distances), samples_per_unit)
                 corners = fragments.faces[face]
                 if wp.min(distances) == 0.0:
