@@ -58,8 +58,11 @@ from warpshadow.stages.silhouettes.lines import (
     line_between,
     make_fragment_arrays,
 )
+from warpshadow.stages.silhouettes.smooth import find_image_weight
 
 MIN_DISTANCE = 0.02  # distance of an edge [samples] below which rounding outweighs how color changes on the way to it
+
+MIN_WEIGHT = 0.25  # of a sample in the smoothed image, by which its slopes are divided
 
 _COST, _MEAN_SLOPE_COST = 20.0, 4.0  # nanoseconds of a sample: its gradient, and the search for its mean slope
 
@@ -195,6 +198,7 @@ def _add_shading_gradients(
     fragments: FragmentArrays,
     entries: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
+    shares: wp.array2d(dtype=wp.vec3),
     edge_colors: wp.array3d(dtype=wp.vec4),
     has_mean_slope: wp.array2d(dtype=wp.bool),
     first_sample_face: int,
@@ -239,7 +243,12 @@ def _add_shading_gradients(
                 weighted_slopes = wp.vec2()
                 distances = wp.vec2()  # lengths over which the differences were measured [samples]
                 edge_steps = wp.vec4()
+                extents = wp.vec2()  # of the sample along both axes [samples]
+                image_weight = float(1.0)
                 if not is_flat:
+                    extents = wp.vec2(1.0, 1.0)
+                    if entry >= 0:
+                        image_weight = wp.max(find_image_weight(fragment, entry, entries, shares, width), MIN_WEIGHT)
                     for direction in range(4):
                         edge = wp.vec2i(NOTHING, NOTHING)
                         if entry >= 0:
@@ -254,6 +263,7 @@ def _add_shading_gradients(
                                 adj_step = wp.dot(adj_color, wp.vec3(color_step[0], color_step[1], color_step[2]))
                                 edge_steps[direction] = direction_sign(direction) * adj_step
                                 distances[direction / 2] += t
+                                extents[direction / 2] += t - 0.5
                         elif edge[0] == NOTHING and has_neighbor(fragment, direction, width, fragments.height):
                             neighbor_sample = neighbor(sample, direction, width)
                             if receiver_face_ids[fragment_batch, neighbor_sample] >= 0:
@@ -264,6 +274,7 @@ def _add_shading_gradients(
                     for direction in range(4):
                         if edge_steps[direction] != 0.0:
                             edge_slope = edge_steps[direction] / distances[direction / 2]
+                            edge_slope *= extents[direction / 2] / image_weight
                             adj_position = -edge_slope * samples_per_unit[direction / 2]
                             edge = edges[entry, direction]
                             adj_a, adj_b = edge_position_adjoint(edge, center, direction / 2, adj_position, clip)
@@ -280,6 +291,8 @@ def _add_shading_gradients(
                         wp.where(distances[0] == 0.0, receiver_slope[0], slope[0]),
                         wp.where(distances[1] == 0.0, receiver_slope[1], slope[1]),
                     )
+                if entry >= 0 and not is_flat:
+                    slope = wp.cw_mul(slope, extents / image_weight)
                 weights = fragments.barycentrics[fragment]
                 depth = wp.dot(weights, wp.vec3(clip[corners[0]][3], clip[corners[1]][3], clip[corners[2]][3]))
                 adj_clip = relative_to_ray_adjoint(center, wp.vec3(-slope[0], -slope[1], 0.0)) / depth
@@ -339,6 +352,7 @@ def moving_radiance(
                 make_fragment_arrays(silhouettes.fragments, silhouettes.faces, clip_positions),
                 silhouettes.entries,
                 silhouettes.edges,
+                silhouettes.shares,
                 edge_colors,
                 has_mean_slope,
                 len(silhouettes.faces) * (1 if silhouettes.fragments.sides is None else 2),
