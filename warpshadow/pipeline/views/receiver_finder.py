@@ -85,8 +85,7 @@ class ReceiverFinder:
                 )
                 quadtree = method.find_squares(self._blocker_kinds, surfaces)
         if at_samples.any() and fragments.barycentrics.requires_grad:
-            is_glossy = gather_of_owners(merged_scene.is_glossy, merged_scene.body_of_face)
-            has_mean_slope = find_mean_slopes(silhouettes, clip_positions, is_glossy, quadtree)
+            has_mean_slope = find_mean_slopes(silhouettes, clip_positions, quadtree)
         body_of_face, separate = merged_scene.body_of_face, self._separate_bodies
         receivers = find_receivers(
             positions,

@@ -20,19 +20,15 @@ Where all neighbors see the same face, the slope is the face's own.
 A sample that is a receiver itself has the exact derivative at its point instead, except beside the outline of its
 surface. There the exact slope is often tiny and rarely huge, as it grows without bound towards a limb, and does not
 match the colors at the edges: gradients of a mirroring ball are half of the differences of images. With mean slopes of
-the samples along an outline, and of their neighbors, the colors of edges cancel. On a body that shines all samples have
-mean slopes: under a sun behind a ball a highlight is as narrow as a sample, and where exact slopes met mean ones, the
-gradient across it was four times the slope of the image, with the wrong sign.
+the samples along an outline, and of their neighbors, the colors of edges cancel.
 """
 
 import math
 from dataclasses import replace
 
-import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import instance_in, rows
-from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch, without_gradient
 from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.parallel import run_length
@@ -132,16 +128,14 @@ def _find_mean_slopes(
     edges: wp.array2d(dtype=wp.vec2i),
     sides: wp.array(dtype=wp.int32),
     keys: wp.array(dtype=wp.int32),
-    is_glossy: wp.array(dtype=wp.bool),
     # out
     has_mean_slope: wp.array(dtype=wp.bool),
 ):
-    """A thread owns a sample: whether both slopes are known, and its surface shines or ends beside it or a neighbor."""
+    """A thread owns a sample: whether its surface ends beside it, or beside a neighbor, and both slopes are known."""
     sample = first_row + wp.tid()
     side = sides[sample]
-    is_at_outline = is_glossy[wp.max(side, 0) % is_glossy.shape[0]]
-    # nearly all samples that do not shine end here
-    has_slopes = side >= 0 and (is_at_outline or _is_near_silhouette(fragments, entries, sample))
+    is_at_outline = bool(False)
+    has_slopes = side >= 0 and _is_near_silhouette(fragments, entries, sample)  # nearly all samples end here
     if keys and has_slopes:
         has_slopes = keys[side] < 0
     if has_slopes:
@@ -160,15 +154,12 @@ def _find_mean_slopes(
     has_mean_slope[sample] = has_slopes and is_at_outline
 
 
-def find_mean_slopes(
-    silhouettes: Silhouettes, clip_positions: wp.array, is_glossy: np.ndarray, quadtree: Quadtree | None = None
-) -> wp.array:
+def find_mean_slopes(silhouettes: Silhouettes, clip_positions: wp.array, quadtree: Quadtree | None = None) -> wp.array:
     """Find the samples that follow their surface by mean slopes although they are receivers.
 
     Args:
         silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`.
         clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex].
-        is_glossy: Whether each face shines, bool of shape [face].
         quadtree: Squares in which samples interpolate, which none of these does; None for none.
     Returns:
         bool of shape [view, sample].
@@ -181,7 +172,6 @@ def find_mean_slopes(
     arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
     keys = None if quadtree is None else quadtree.square_key_of_side
     inputs = [arrays, silhouettes.entries, silhouettes.edges, reshaped(sides, (-1,)), keys]
-    inputs.append(constant(is_glossy, wp.bool, sides.device))
     launch(
         _find_mean_slopes, sides.size, inputs=inputs, outputs=[reshaped(has_mean_slope, (-1,))], cost=_MEAN_SLOPE_COST
     )
