@@ -276,6 +276,31 @@ def test_gradients_along_a_path_are_the_change_of_the_image_although_a_sun_shine
     assert error < SUN
 
 
+def test_gradients_along_the_limb_of_a_metal_that_hides_the_sun_are_on_average_the_slopes_of_the_image():
+    """The highlight is about a sample wide, and a sample off the limb, above the middle: it moves to the right."""
+    ball = ws.Body(ws.icosphere(0.4, 4), albedo=(0.9, 0.7, 0.3), roughness=0.3, metallic=1.0)
+    sun = ws.synthetic_sky((0.2, 0.5, -1), sun_radius=2, sun_strength=3, height=64)
+    size, half_width = 48, 0.03  # of the square in which the ball is moved: three pixels of 0.02
+    scene = ws.Scene([ball], sun, ws.Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=18, size=(size, size)))
+    renderer, rng = TorchRenderer(scene, progress=False), np.random.default_rng(0)
+    rotations, translations, scales = renderer.scene_poses()
+    rows, columns = torch.meshgrid(torch.linspace(-1, 1, size), torch.linspace(-1, 1, size), indexing="ij")
+    image_weights = (1 + 0.5 * columns + 0.3 * rows)[..., None]
+
+    def losses(places):
+        shifts = torch.nn.functional.pad(places, (0, 1))[:, None]
+        images = renderer(geometry=renderer.placed(rotations, translations + shifts, scales))
+        return (images[..., :3] * image_weights).sum((1, 2, 3))
+
+    places = torch.tensor(rng.uniform(-half_width, half_width, (24, 2)), dtype=torch.float32, requires_grad=True)
+    gradient = torch.autograd.grad(losses(places).sum(), places)[0].mean(0)
+    ends = places.detach().repeat(2, 1)
+    ends[:24, 0], ends[24:, 0] = half_width, -half_width
+    right, left = losses(ends).reshape(2, 24).mean(1)
+    slope = (right - left) / (2 * half_width)
+    assert abs(gradient[0] - slope) < 0.25 * abs(slope), (gradient, slope)
+
+
 @pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render()])
 def test_a_metal_reflects_the_ground_where_light_bounces(render):
     """In a white furnace a smooth white metal on a white ground is nearly white; direct light leaves it 13% darker."""

@@ -213,11 +213,14 @@ def exponential(f, base, threshold, *, quiet=6.0, loud=24.0):
 # ------------------------------------------------------------------------------------------ directional
 
 
-def transmittance(points, centers, radii, directions, softness=0.35):
-    """Transmittance of spheres towards directions, [vertex, direction], by angles."""
+def transmittance(points, centers, radii, directions, softness=0.35, footprints=0.0):
+    """Transmittance of spheres towards directions, [vertex, direction], by angles; footprints are areas [vertex]."""
     toward, cosine, weight = cones(points[:, None], centers, radii)
     theta = np.arccos(cosine)
-    width = softness * 2 / np.sqrt(len(directions))
+    squared = np.maximum(np.sum((centers - points[:, None]) ** 2, axis=-1) - radii**2, 0)
+    spread = 5 / 12 * np.broadcast_to(footprints, len(points))[:, None]
+    spread = spread / np.maximum(squared + 2 * spread, 1e-37)
+    width = np.arcsin(np.sqrt(np.sin(softness * 2 / np.sqrt(len(directions))) ** 2 + spread))
     low = np.cos(np.minimum(theta + width, np.pi))
     high = np.cos(np.maximum(theta - width, 0))
     opacity = np.minimum(1, 2 * np.sin(theta / 2) ** 2 / (1 - (high + low) / 2)) * weight

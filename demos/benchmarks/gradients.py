@@ -4,10 +4,10 @@
 
 The losses are sums of the image weighted with a few random waves; the parameters the pose of the bunny (turn, shift)
 and that of the camera. The error is the relative L2 of the gradient over all losses and parameters, against differences
-of the same image ("own"), and for the pose of one with up to 16 × 16 samples a pixel ("fine"), which is nearer to the
-image that there would be without pixels. Differences reach over half a sample, since over less an image jumps where
-samples flip; in a small image so far that shadows bend on the way, and "fine" is the one to trust. "shadow alone" sees
-the ground with the bunny out of view.
+of the same image ("own"), and for the pose of the means of one that is up to 16 times as large ("fine"), nearer to the
+image that there would be without pixels. (More samples of a pixel would share its receivers on a ground.) Differences
+reach over half a sample, since over less an image jumps where samples flip; in a small image so far that shadows bend
+on the way, and "fine" is the one to trust. "shadow alone" sees the ground with the bunny out of view.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from demos.scenes import bunny_scene
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
 FINE = 1280
-"""Samples across an image that differences are compared with, as far as 16 in a pixel make as many."""
+"""Pixels across an image whose means differences are compared with, as far as 16 times the size makes as many."""
 
 
 def main(methods: list[str], sizes: list[int], loss_count: int) -> None:
@@ -45,8 +45,8 @@ def main(methods: list[str], sizes: list[int], loss_count: int) -> None:
             if method == "none" and "shadow" in name:
                 continue
             fine = {
-                size: differences(renderer_of(seen, size, min(16, FINE // size)), image_of, loss_count)
-                for size in sizes
+                size: differences(renderer_of(seen, times * size, 1), image_of, loss_count, times)
+                for size, times in ((size, min(16, FINE // size)) for size in sizes)
                 if name == "pose"
             }
             for supersampling in sample_counts:
@@ -90,6 +90,11 @@ def camera_image(renderer: TorchRenderer, values: torch.Tensor) -> torch.Tensor:
     return renderer(clip_matrices=renderer.clip_matrices(turned, shift + values[3:], matrix))
 
 
+def means(image: torch.Tensor, times: int) -> torch.Tensor:
+    """Means of so many pixels across and down."""
+    return torch.nn.functional.avg_pool2d(image.movedim(-1, 0), times).movedim(0, -1)
+
+
 def losses(image: torch.Tensor, count: int) -> torch.Tensor:
     """Sums of the colors weighted with waves, shape [count]."""
     height, width, _ = image.shape
@@ -112,11 +117,14 @@ def gradients(renderer: TorchRenderer, image_of: Callable, count: int) -> np.nda
     return np.stack([torch.autograd.grad(value, start, retain_graph=True)[0].numpy() for value in values])
 
 
-def differences(renderer: TorchRenderer, image_of: Callable, count: int) -> np.ndarray:
-    """Central differences of the losses, shape [loss, parameter]."""
+def differences(renderer: TorchRenderer, image_of: Callable, count: int, times: int = 1) -> np.ndarray:
+    """Central differences of the losses, shape [loss, parameter], of the means of so many pixels across and down."""
     step = step_of(renderer)
     with torch.no_grad():
-        ends = [[losses(image_of(renderer, sign * step * axis), count) for sign in (1, -1)] for axis in torch.eye(6)]
+        ends = [
+            [losses(means(image_of(renderer, sign * step * axis), times), count) for sign in (1, -1)]
+            for axis in torch.eye(6)
+        ]
     return np.stack([((right - left) / (2 * step)).numpy() for right, left in ends], axis=-1)
 
 

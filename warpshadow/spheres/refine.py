@@ -112,7 +112,7 @@ def _make_project(lanes: int) -> wp.Kernel:
         sine = sqrt(cone.sine2)
         low = cos_width * cone.cosine - sin_width * sine
         outer = cos_width * sine + sin_width * cone.cosine
-        slope, opacity = falloff(cone, sine, low, cos_width, sin_width)
+        slope, opacity = falloff(cone, sine, low, Lane(cos_width), Lane(sin_width))
         bits = Lane(0.0)  # bit b: the sphere reaches bundle b; a float is exact for up to 24
         bit = float(1.0)
         for bundle in range(caps.shape[0]):
@@ -175,8 +175,17 @@ def _make_project_adjoint(lanes: int) -> wp.Kernel:
             sum_t[lane] = factor * gradient[4]
             adj_opacity[lane] = -gradient[5]
             slope[lane] = edge[1]
-        adj_offset, adj_radius, _ = sphere_adjoint(
-            sphere_view, sine, low, cos_width, sin_width, slope, adj_opacity, sum_, sum_t, Vectors(x, y, z)
+        adj_offset, adj_radius, _, _, _ = sphere_adjoint(
+            sphere_view,
+            sine,
+            low,
+            Lane(cos_width),
+            Lane(sin_width),
+            slope,
+            adj_opacity,
+            sum_,
+            sum_t,
+            Vectors(x, y, z),
         )
         adj_balls[block, sphere] = wp.vec4(
             total(dot(frame_axis(frame_rows, block, 3, 3), adj_offset)),

@@ -135,3 +135,33 @@ def test_pose_gradients_are_central_differences_of_images():
         with torch.no_grad():
             slopes.append(float(loss(moved) - loss(-moved)) / (2 * step))
     assert np.linalg.norm(shift.grad[0, 0].numpy() - slopes) < 0.05 * np.linalg.norm(slopes)
+
+
+@pytest.mark.parametrize("receivers", ["pixel", "adaptive"])
+def test_pose_gradients_under_a_narrow_sun_are_differences_of_images_that_resolve_its_edge(receivers):
+    """Of a ball that is pushed over the ground: at its foot the edge is far narrower than a pixel."""
+    size, times, step = 32, 8, 5e-3
+    scene = scene_of(receivers, size=size, sun_radius=0.5)
+    ball = dataclasses.replace(scene.bodies[0], translation=(0, 0.52, 0))
+    scene = dataclasses.replace(scene, bodies=(ball, scene.bodies[1]))
+    large = dataclasses.replace(scene, camera=scene.camera.resized(times), supersampling=1)
+    renderer, truth = TorchRenderer(scene), TorchRenderer(large)
+    rows, columns = torch.meshgrid(torch.linspace(0, 5, size), torch.linspace(0, 4, size), indexing="ij")
+    weights = torch.stack([torch.sin(rows + k) * torch.cos(columns + 2 * k) for k in range(3)], -1)
+
+    def loss(renderer, x):
+        rotations, translations, scales = renderer.scene_poses()
+        shift = x * torch.eye(3)[0] * torch.tensor([[[1.0], [0.0]]])
+        image = renderer(geometry=renderer.placed(rotations, translations + shift, scales))[0][..., :3].double()
+        pixels = image.reshape(size, image.shape[0] // size, size, image.shape[1] // size, 3).mean((1, 3))
+        return (pixels * weights).sum()
+
+    slopes, gradients = [], []
+    for start in np.linspace(-0.1, 0.1, 5):
+        x = torch.tensor(start, dtype=torch.float32, requires_grad=True)
+        loss(renderer, x).backward()
+        gradients.append(float(x.grad))
+        with torch.no_grad():
+            slopes.append(float(loss(truth, x + step) - loss(truth, x - step)) / (2 * step))
+    # measured 2.2% by pixel, 4.3% adaptive; of receivers without footprints 11 and 13%
+    assert relative(np.array(gradients), np.array(slopes)) < 0.08

@@ -8,7 +8,7 @@ from meshes import through_plane
 import warpshadow as ws
 from warpshadow.maths.adjacency import edge_neighbors
 from warpshadow.stages.image.film import sample_radiance
-from warpshadow.stages.image.slopes import MIN_DISTANCE, moving_radiance
+from warpshadow.stages.image.slopes import MIN_DISTANCE, MIN_WEIGHT, moving_radiance
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.rasterization import rasterize
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
@@ -73,6 +73,24 @@ class Drawn:
         return self.clip.grad.numpy()[0].astype(float)
 
 
+def image_weight(drawn, sample):
+    """Weight of a sample in all of the smoothed image."""
+    entries, shares = drawn.silhouettes.entries.numpy(), drawn.silhouettes.shares.numpy().astype(float)
+    if entries[sample] < 0:
+        return 1.0
+
+    def taken(number, side):
+        (area, weight, end), across = shares[number, side], shares[number, [2, 3] if side < 2 else [0, 1]]
+        losses = 0.5 * (1 + across[:, 2] - end) * np.maximum(weight + across[:, 1] - 1, 0) * across[:, 0]
+        return area * (weight - losses.sum())
+
+    total = 1.0
+    for side, step in enumerate([1, -1, CAMERA.width, -CAMERA.width]):
+        if shares[entries[sample], side, 1] > 0:
+            total += taken(entries[sample + step], side ^ 1) - taken(entries[sample], side)
+    return max(total, MIN_WEIGHT)
+
+
 def twin(drawn):
     """The same in float64, from what was found: a sum over samples of −slope · motion on screen."""
     width, height = CAMERA.width, CAMERA.height
@@ -90,7 +108,7 @@ def twin(drawn):
             column, row = sample % width, sample // width
             here, corners = np.array([column + 0.5, row + 0.5]), clip[faces[face_ids[sample]]]
             slope = np.zeros((2, 3))
-            around = []
+            around, edge_steps, extents = [], [], np.ones(2)
             for axis in range(2):
                 rises, spans = np.zeros(3), 0.0
                 for sign in (1, -1):
@@ -109,12 +127,15 @@ def twin(drawn):
                             np.stack([*clip[edge][:, [0, 1, 3]], [*(2 * here / [width, height] - 1), 1]])
                         )
                         if is_own > 0 and t > MIN_DISTANCE:
-                            rises += sign * (edge_colors[batch, entries[sample], side] - color[sample])
+                            step = sign * (edge_colors[batch, entries[sample], side] - color[sample])
+                            edge_steps.append((axis, edge, step))
                             spans += t
+                            extents[axis] += t - 0.5
                     elif edge[0] == -1 and face_ids[other] >= 0:
                         rises += sign * 0.5 * albedo[sample] * (received[other] - received[sample])
                         spans += 0.5
                 slope[axis] = rises / spans if spans else np.nan
+                edge_steps = [(k, edge, step / spans if k == axis else step) for k, edge, step in edge_steps]
             for axis in range(2):
                 if all(around) or np.isnan(slope[axis, 0]):
                     ends = []
@@ -123,8 +144,17 @@ def twin(drawn):
                         found = np.linalg.solve(corners[:, [0, 1, 3]].T, ray)
                         ends.append(found / found.sum() @ shading[faces[face_ids[sample]]])
                     slope[axis] = albedo[sample] * (ends[0] - ends[1]) / 2e-4
-            x, y = slope @ seeds[sample] * [width / 2, height / 2]
+            factors = extents / image_weight(drawn, sample)
             u, v = 2 * here / [width, height] - 1
+            for axis, edge, step in edge_steps:
+                ends = clip[edge]
+                offsets = ends[:, 1 - axis] - [u, v][1 - axis] * ends[:, 3]
+                shares = np.linalg.solve([offsets, ends[:, 3]], [0, 1])
+                pull = np.zeros(4)
+                pull[[axis, 3]] = 1, -(shares @ ends[:, axis])
+                pull *= -step @ seeds[sample] * factors[axis] * [width, height][axis] / 2
+                np.add.at(pulls, edge, shares[:, None] * pull)
+            x, y = factors * (slope @ seeds[sample]) * [width / 2, height / 2]
             pull = np.array([-x, -y, 0, x * u + y * v]) / (weights[sample] @ corners[:, 3])
             np.add.at(pulls, faces[face_ids[sample]], weights[sample][:, None] * pull)
     return pulls

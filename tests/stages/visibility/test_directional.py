@@ -59,6 +59,37 @@ def test_softness_widens_the_edge_like_the_twins(softness, device):
     assert np.abs(got - expected).max() < 10 * FLOAT32[64] + OPAQUE  # at κ = 0.1 the step is up to 12 times as steep
 
 
+@pytest.mark.parametrize("facing", [False, True])
+def test_footprints_widen_edges_like_the_twins_the_more_the_nearer_these_are(facing, device):
+    points, normals, centers, radii = twins.random_scene(4, vertex_count=40)
+    points[:4] = centers[:4] + radii[:4, None] * np.float32([0, 1.0, 0])  # touching: edges of 45°
+    normals[:4] = [0, -1, 0]
+    areas = np.random.default_rng(0).uniform(0, 0.3, 40) ** 2
+    areas[::5] = 0
+    directions = cells.fibonacci(64)
+    footprints = wp.array(areas[None], dtype=wp.float32, device=device)
+    arguments = points, normals if facing else None, centers, radii
+    got = transmittance(*arguments, directions, device, softness=0.1, footprints=footprints)
+    expected = twins.transmittance(*wide(points, centers, radii), directions, 0.1, areas)
+    is_above = normals @ directions.T > 0 if facing else np.ones(got.shape, bool)
+    assert np.abs(got - expected)[is_above].max() < 10 * FLOAT32[64] + OPAQUE
+
+
+def test_an_edge_moves_over_a_footprint_as_its_mean_over_a_square_does(device):
+    """Of a receiver on a plane, beside the shadow of a sphere under a light from above, by the variance of the step."""
+    side, towards = 0.1, np.tile([0.0, 0, 1], (16, 1))
+    x = np.linspace(0.7, 1.3, 400)
+    points = np.stack([x, np.zeros(400), np.full(400, -1.0)], axis=1)
+    footprints = wp.full((1, 400), side**2, dtype=wp.float32, device=device)
+    options = {"device": device, "softness": 2.1 * cells.MIN_WIDTH, "footprints": footprints}
+    steps = np.diff(transmittance(points, None, [[0, 0, 0]], [1.0], towards, **options)[:, 0])
+    middles = (x[1:] + x[:-1]) / 2
+    middle = np.average(middles, weights=steps)
+    assert abs(middle - 1) < 0.01
+    variance = np.average((middles - middle) ** 2, weights=steps)
+    assert abs(variance / (side**2 / 12) - 1) < 0.1
+
+
 @pytest.mark.parametrize("count", [64, 128])
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.95])
 def test_a_bundle_opposite_to_a_sphere_is_not_culled_where_the_soft_edge_reaches_it(count, share, device):
@@ -295,6 +326,9 @@ def test_arrays_that_do_not_fit_together_are_refused(device):
         directional.transmittance(points, zeros(2, 4), centers, radii, cells.fibonacci(16))
     with pytest.raises(ValueError, match=r"centers: got shape \(1, 3\), expected \[2, sphere\]"):
         directional.transmittance(points, normals, zeros(1, 3), radii, cells.fibonacci(16))
+    footprints = zeros(2, 4, dtype=wp.float32)
+    with pytest.raises(ValueError, match=r"footprints: got shape \(2, 4\), expected \[2, 5\]"):
+        directional.transmittance(points, normals, centers, radii, cells.fibonacci(16), footprints=footprints)
     with pytest.raises(ValueError, match=r"radii: got shape \(2, 2\), expected \[2, 3\]"):
         directional.transmittance(points, normals, centers, zeros(2, 2, dtype=wp.float32), cells.fibonacci(16))
 

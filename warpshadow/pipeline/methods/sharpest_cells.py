@@ -15,6 +15,7 @@ from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT
 from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.light.shading import shade_cells
 from warpshadow.stages.planes.coverage import plane_coverage
+from warpshadow.stages.receivers.footprints import find_seen_areas
 from warpshadow.stages.visibility import directional
 from warpshadow.stages.visibility.sharp_cells import SharpCells
 
@@ -73,9 +74,9 @@ def find_share_of_sharpest_light(
     if not radii.shape[1] and group.planes is None and group.convex_parts_around is None:
         return None
     if radii.shape[1]:
-        transmittance = directional.transmittance(
-            points, normals, centers, radii, directions, softness=softness, merging=merging
-        )
+        footprints = None if group.footprints is None else find_seen_areas(group.footprints, directions)
+        arguments = points, normals, centers, radii, directions
+        transmittance = directional.transmittance(*arguments, softness=softness, merging=merging, footprints=footprints)
     else:
         transmittance = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
     coverages = []

@@ -98,6 +98,7 @@ class Group:
     nearest_blockers: NearestBlockers | None = None  # None where receivers are not patch samples
     skip: tuple[int, int] = (0, 0)  # spheres that do not block: the first, and the one after the last
     clusters: ClusterTree | None = None  # of the spheres, where they are found already
+    footprints: wp.array | None = None  # [batch, receiver] vec3, areas for which they stand; None for points
 
     @property
     def is_blocked_by_planes(self) -> bool:
@@ -152,13 +153,16 @@ class Group:
         part_corners = None if parts is None else parts.placed_parts.corners
         arguments = points, normals, centers, radii = self.points, self.normals, self.centers, self.radii
         others = {"rotations": rotation_data, "planes": frames, "positions": positions, "parts": part_corners}
+        footprints = self.footprints
         if radii.shape[1] or any(array is not None for array in (rotation_data, frames, part_corners)):
             count = common_batch({"points": points, "centers": centers, "radii": radii} | others)
             points, normals, centers, radii = [expand(array, count) for array in arguments]
+            footprints = None if footprints is None else expand(footprints, count)
             clusters = clusters if radii is self.radii and centers is self.centers else None
         size = points.shape[1]
         if self.cached_rows is not None or size <= RECEIVERS_AT_ONCE or varies([*arguments, *others.values()]):
-            yield replace(self, points=points, normals=normals, centers=centers, radii=radii, clusters=clusters)
+            spheres = {"centers": centers, "radii": radii, "clusters": clusters}
+            yield replace(self, points=points, normals=normals, footprints=footprints, **spheres)
             return
         for start in range(0, size, RECEIVERS_AT_ONCE):
             portion = slice(start, min(start + RECEIVERS_AT_ONCE, size))
@@ -169,6 +173,7 @@ class Group:
                 centers=centers,
                 radii=radii,
                 own=None if own is None else own.cut(portion),
+                footprints=None if footprints is None else footprints[:, portion].contiguous(),
                 nearest_blockers=None if self.nearest_blockers is None else self.nearest_blockers.cut(portion),
                 clusters=clusters,
             )
@@ -253,10 +258,11 @@ class Blockers(NamedTuple):
             return None
         return GroupConvexParts(self.parts.blockers(bodies, (body,)), self.placed_parts, on_surface=True)
 
-    def around_plane(self, points: wp.array, normals: wp.array, body: int) -> Group:
+    def around_plane(self, points: wp.array, normals: wp.array, footprints: wp.array, body: int) -> Group:
         """The group of points of a flat body."""
         planes, parts = self.planes_around(body), self.convex_parts_around()
-        return Group(points, normals, *self.spheres_of(self.bodies), planes=planes, convex_parts_around=parts)
+        spheres = self.spheres_of(self.bodies)
+        return Group(points, normals, *spheres, planes=planes, convex_parts_around=parts, footprints=footprints)
 
 
 def _choose_blocking(
@@ -306,8 +312,9 @@ def _groups_that_move(
     spheres, none = blockers.spheres_of(sphere_bodies), blockers.spheres_of([])
     clusters, nearest_blockers = None, _nearest_blockers(nearest_spheres, blockers)
     if not receivers.spans:
-        points_and_normals = receivers.points, receivers.normals
-        yield Group(*points_and_normals, *spheres, planes=blockers.planes_around(), nearest_blockers=nearest_blockers)
+        points_and_normals, planes = (receivers.points, receivers.normals), blockers.planes_around()
+        group = Group(*points_and_normals, *spheres, planes=planes, nearest_blockers=nearest_blockers)
+        yield replace(group, footprints=receivers.footprints)
     for span in receivers.spans:
         points_and_normals = receivers.points, receivers.normals
         assert receivers.vertices is not None
@@ -320,6 +327,8 @@ def _groups_that_move(
         points, normals = (cut(array, span.first, span.end) for array in points_and_normals)
         planes, parts = blockers.planes_around(span.body), blockers.convex_parts_around(span.body)
         group = Group(points, normals, *others, planes=planes, convex_parts_around=parts)
+        if receivers.footprints is not None and not is_at_vertices:
+            group = replace(group, footprints=cut(receivers.footprints, span.first, span.end))
         if others is spheres:
             clusters = clusters or find_clusters(*spheres, blockers.merging)
             group = replace(group, skip=skip, clusters=clusters)

@@ -1,16 +1,20 @@
 """Receivers of a view: at the vertices that it shows, at samples, and on flat bodies at the corners of squares."""
 
+import functools
+
 import numpy as np
 import warp as wp
 
 from warpshadow.device.constants import gather_of_owners
 from warpshadow.device.cuda_graph import is_readable
+from warpshadow.device.launch import without_gradient
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, VisibleSurfaces
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.image.slopes import find_mean_slopes
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
+from warpshadow.stages.receivers.footprints import find_footprints
 from warpshadow.stages.silhouettes.find import Silhouettes
 
 MAX_SHARED = 2
@@ -74,7 +78,16 @@ class ReceiverFinder:
             at_samples = at_samples & ~has_cached_rows
             numbering = self._number_seen(seen_vertices(fragments, silhouettes, positions.shape[1]), has_cached_rows)
             if spheres is not None and (is_adaptive := method.is_adaptive & at_samples).any():
-                surfaces = VisibleSurfaces(positions, normals, fragments, spheres, is_adaptive, self._supersampling)
+                surfaces = VisibleSurfaces(
+                    positions,
+                    normals,
+                    fragments,
+                    spheres,
+                    is_adaptive,
+                    self._supersampling,
+                    without_gradient(clip_positions),
+                    self._footprint_widths,
+                )
                 quadtree = method.find_squares(self._blocker_kinds, surfaces)
         if at_samples.any() and fragments.barycentrics.requires_grad:
             has_mean_slope = find_mean_slopes(silhouettes, clip_positions, quadtree)
@@ -82,7 +95,7 @@ class ReceiverFinder:
             self._may_share_surfaces and min(fragments.face_ids.shape[1:]) >= _MIN_SHARED_SIZE * self._supersampling
         )
         body_of_face, separate = merged_scene.body_of_face, self._separate_bodies
-        return find_receivers(
+        receivers = find_receivers(
             positions,
             normals,
             merged_scene.faces,
@@ -97,6 +110,29 @@ class ReceiverFinder:
             has_mean_slope=has_mean_slope,
             shares_receivers=None if method.shares_lobes else gather_of_owners(~merged_scene.is_glossy, body_of_face),
         )
+        if receivers.sample_fragments is None or method.every_sample_receives:
+            return receivers
+        size = fragments.face_ids.shape[1] // self._supersampling, fragments.face_ids.shape[2] // self._supersampling
+        footprints = find_footprints(
+            receivers.sample_fragments,
+            merged_scene.faces,
+            self._footprint_widths,
+            positions,
+            clip_positions,
+            size,
+            receivers.points.shape,
+        )
+        return receivers._replace(footprints=footprints)
+
+    @functools.cached_property
+    def _footprint_widths(self) -> np.ndarray:
+        """Width of the footprint of a receiver on each face [pixels]: 0 but on flat bodies.
+
+        Towards the limb of a curved surface its plane has far more of a pixel than the surface.
+        """
+        merged_scene = self._merged_scene
+        widths = np.where(merged_scene.is_glossy, 1 / self._supersampling, 1.0) * merged_scene.is_flat
+        return widths[merged_scene.body_of_face].astype(np.float32)
 
     def _number_seen(self, is_seen: np.ndarray, has_cached_rows: np.ndarray) -> Numbering:
         """Number the vertices that are seen, of bodies with receivers there and of bodies with cached rows."""

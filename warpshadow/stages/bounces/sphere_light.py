@@ -177,7 +177,7 @@ def _make_light(lanes: int) -> wp.Kernel:
     sqrt, is_any_above, dot_direction, add_vectors = fn.sqrt, fn.is_any_above, fn.dot_direction, fn.add_vectors
     load_task, falloff = _make_load_task(lanes), make_falloff(lanes)
     find_weight = make_weight_functions(lanes).weight
-    widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
+    widen_cone, _, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(True, lanes)
     SUMS = wp.constant(_SUMS)
     MIN_DENOMINATOR = wp.constant(_MIN_DENOMINATOR)
 
@@ -202,9 +202,9 @@ def _make_light(lanes: int) -> wp.Kernel:
         cone = sphere_view.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
-        cap = widen_cone(cone.axis, cone.cosine, sine, cells)
+        cap = widen_cone(cone.axis, cone.cosine, sine, Lane(0.0), receivers, cells)
         if is_above_horizon(cap, receivers.normals):
-            slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
+            slope, opacity = falloff(cone, sine, cap.cosine, cap.cos_width, cap.sin_width)
             weight = find_weight(sphere_view.offset, sphere_view.curvature, sphere_view.node, task.weights)
             opacity = wp.cw_mul(opacity, weight)
             for k in range(count):

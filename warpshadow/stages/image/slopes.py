@@ -9,9 +9,13 @@ is far from the mean. So the mean over the sample is taken. To the right of the 
 
 and likewise to the other sides. An edge at t > ½ lies in the neighbor, which shows this surface up to it. With the step
 c_edge − c over t, steps along a row add up to the color at the surface's right edge minus that at its left; the
-derivative of the moving edges has the same with the other sign, and both cancel. Where another surface comes in front
-before the neighbor's center, or the image ends, the opposite half counts alone. Where all neighbors see the same face,
-the slope is the face's own.
+derivative of the moving edges has the same with the other sign, and both cancel. For that a step to an edge moves with
+the edge's point, not the sample's; and a sample counts along a row with its extent there, ½ + t beside an edge, and so
+along a column, not with its weight in the smoothed image, which is that of one of both. (Else a ball of metal of
+roughness 0.2 before a sun has a gradient of −3500 where the slope of the image is 1300; so it has 1360.)
+
+Where another surface comes in front before the neighbor's center, or the image ends, the opposite half counts alone.
+Where all neighbors see the same face, the slope is the face's own.
 
 A sample that is a receiver itself has the exact derivative at its point instead, except beside the outline of its
 surface. There the exact slope is often tiny and rarely huge, as it grows without bound towards a limb, and does not
@@ -50,11 +54,15 @@ from warpshadow.stages.silhouettes.lines import (
     NOTHING,
     FragmentArrays,
     edge_line,
+    edge_position_adjoint,
     line_between,
     make_fragment_arrays,
 )
+from warpshadow.stages.silhouettes.smooth import find_image_weight
 
 MIN_DISTANCE = 0.02  # distance of an edge [samples] below which rounding outweighs how color changes on the way to it
+
+MIN_WEIGHT = 0.25  # of a sample in the smoothed image, by which its slopes are divided
 
 _COST, _MEAN_SLOPE_COST = 20.0, 4.0  # nanoseconds of a sample: its gradient, and the search for its mean slope
 
@@ -184,6 +192,7 @@ def _add_shading_gradients(
     fragments: FragmentArrays,
     entries: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
+    shares: wp.array2d(dtype=wp.vec3),
     edge_colors: wp.array3d(dtype=wp.vec4),
     has_mean_slope: wp.array2d(dtype=wp.bool),
     first_sample_face: int,
@@ -227,7 +236,13 @@ def _add_shading_gradients(
                         is_flat = is_flat and fragments.face_ids[neighbor(fragment, direction, width)] == face
                 weighted_slopes = wp.vec2()
                 distances = wp.vec2()  # lengths over which the differences were measured [samples]
+                edge_steps = wp.vec4()
+                extents = wp.vec2()  # of the sample along both axes [samples]
+                image_weight = float(1.0)
                 if not is_flat:
+                    extents = wp.vec2(1.0, 1.0)
+                    if entry >= 0:
+                        image_weight = wp.max(find_image_weight(fragment, entry, entries, shares, width), MIN_WEIGHT)
                     for direction in range(4):
                         edge = wp.vec2i(NOTHING, NOTHING)
                         if entry >= 0:
@@ -240,14 +255,26 @@ def _add_shading_gradients(
                                 # own colors
                                 color_step = edge_colors[batch - fragment_batch, entry, direction] - color
                                 adj_step = wp.dot(adj_color, wp.vec3(color_step[0], color_step[1], color_step[2]))
-                                weighted_slopes[direction / 2] += direction_sign(direction) * adj_step
+                                edge_steps[direction] = direction_sign(direction) * adj_step
                                 distances[direction / 2] += t
+                                extents[direction / 2] += t - 0.5
                         elif edge[0] == NOTHING and has_neighbor(fragment, direction, width, fragments.height):
                             neighbor_sample = neighbor(sample, direction, width)
                             if receiver_face_ids[fragment_batch, neighbor_sample] >= 0:
                                 light_step = wp.dot(adj_light, light[light_batch, neighbor_sample] - sample_light)
                                 weighted_slopes[direction / 2] += direction_sign(direction) * 0.5 * light_step
                                 distances[direction / 2] += 0.5
+                if wp.length_sq(edge_steps) > 0.0:
+                    for direction in range(4):
+                        if edge_steps[direction] != 0.0:
+                            edge_slope = edge_steps[direction] / distances[direction / 2]
+                            edge_slope *= extents[direction / 2] / image_weight
+                            adj_position = -edge_slope * samples_per_unit[direction / 2]
+                            edge = edges[entry, direction]
+                            adj_a, adj_b = edge_position_adjoint(edge, center, direction / 2, adj_position, clip)
+                            if wp.isfinite(adj_a) and wp.isfinite(adj_b):
+                                wp.atomic_add(adj_clip_positions, fragment_batch, edge[0], adj_a)
+                                wp.atomic_add(adj_clip_positions, fragment_batch, edge[1], adj_b)
                 slope = wp.cw_mul(wp.cw_div(weighted_slopes, distances), samples_per_unit)
                 corners = fragments.faces[face]
                 if wp.min(distances) == 0.0:
@@ -258,6 +285,8 @@ def _add_shading_gradients(
                         wp.where(distances[0] == 0.0, receiver_slope[0], slope[0]),
                         wp.where(distances[1] == 0.0, receiver_slope[1], slope[1]),
                     )
+                if entry >= 0 and not is_flat:
+                    slope = wp.cw_mul(slope, extents / image_weight)
                 weights = fragments.barycentrics[fragment]
                 depth = wp.dot(weights, wp.vec3(clip[corners[0]][3], clip[corners[1]][3], clip[corners[2]][3]))
                 adj_clip = relative_to_ray_adjoint(center, wp.vec3(-slope[0], -slope[1], 0.0)) / depth
@@ -317,6 +346,7 @@ def moving_radiance(
                 make_fragment_arrays(silhouettes.fragments, silhouettes.faces, clip_positions),
                 silhouettes.entries,
                 silhouettes.edges,
+                silhouettes.shares,
                 edge_colors,
                 has_mean_slope,
                 len(silhouettes.faces) * (1 if silhouettes.fragments.sides is None else 2),

@@ -37,11 +37,16 @@ from warpshadow.stages.raster.screen import (
     line_slope,
     neighbor,
     opposite,
-    relative_to_ray,
     relative_to_ray_adjoint,
     sample_center,
 )
-from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, image_index, line_between
+from warpshadow.stages.silhouettes.lines import (
+    NOTHING,
+    FragmentArrays,
+    edge_position_adjoint,
+    image_index,
+    line_between,
+)
 
 wp.set_module_options({"max_unroll": 1})  # loops that are not unrolled compile faster, and run as fast
 
@@ -113,14 +118,9 @@ def _measure_areas_adjoint(
         # of the line's x in a row, or its y in a column
         adj_position = direction_sign(direction) * adj_area * area_slope * samples_per_unit[axis]
         if edge[0] >= 0:
-            offset_a = relative_to_ray(clip[edge[0]], center)[1 - axis]
-            offset_b = relative_to_ray(clip[edge[1]], center)[1 - axis]
-            cross_component = wp.where(axis == 0, -line[0], line[1])
-            point = line / line[axis]
-            point[1 - axis] = 0.0
-            adj_clip = adj_position * relative_to_ray_adjoint(center, point)
-            wp.atomic_add(adj_clip_positions, batch, edge[0], (offset_b / cross_component) * adj_clip)
-            wp.atomic_add(adj_clip_positions, batch, edge[1], (-offset_a / cross_component) * adj_clip)
+            adj_a, adj_b = edge_position_adjoint(edge, center, axis, adj_position, clip)
+            wp.atomic_add(adj_clip_positions, batch, edge[0], adj_a)
+            wp.atomic_add(adj_clip_positions, batch, edge[1], adj_b)
         else:
             for end in range(2):
                 fragment = sample

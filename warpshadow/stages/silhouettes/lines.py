@@ -3,7 +3,13 @@
 import warp as wp
 
 from warpshadow.stages.raster.rasterization import Fragments
-from warpshadow.stages.raster.screen import face_plane, neighbor, relative_to_ray, sample_center
+from warpshadow.stages.raster.screen import (
+    face_plane,
+    neighbor,
+    relative_to_ray,
+    relative_to_ray_adjoint,
+    sample_center,
+)
 
 NOTHING = -1
 INTERSECTION = -2  # in place of an edge's vertices, where there is no line, and where there is that of two faces
@@ -42,6 +48,21 @@ def edge_line(edge: wp.vec2i, position: wp.vec2, clip_positions: wp.array(dtype=
     return wp.cross(
         relative_to_ray(clip_positions[edge[0]], position), relative_to_ray(clip_positions[edge[1]], position)
     )
+
+
+@wp.func
+def edge_position_adjoint(
+    edge: wp.vec2i, center: wp.vec2, axis: int, adj_position: float, clip_positions: wp.array(dtype=wp.vec4)
+):
+    """Adjoints of both ends of an edge, by where its point in the row (axis 0) or column (1) of a position is there."""
+    line = edge_line(edge, center, clip_positions)
+    offset_a = relative_to_ray(clip_positions[edge[0]], center)[1 - axis]
+    offset_b = relative_to_ray(clip_positions[edge[1]], center)[1 - axis]
+    cross_component = wp.where(axis == 0, -line[0], line[1])
+    point = line / line[axis]
+    point[1 - axis] = 0.0
+    adj_clip = adj_position * relative_to_ray_adjoint(center, point)
+    return (offset_b / cross_component) * adj_clip, (-offset_a / cross_component) * adj_clip
 
 
 @wp.func

@@ -43,6 +43,26 @@ def _area_weight(shares: wp.array(dtype=wp.vec3), direction: int):
     return weight - _overlap_loss(shares[direction], shares[perpendicular + 1]) * shares[perpendicular + 1][0]
 
 
+@wp.func
+def find_image_weight(
+    sample: int,
+    entry: int,
+    entries: wp.array(dtype=wp.int32),
+    shares: wp.array2d(dtype=wp.vec3),
+    width: int,
+):
+    """Weight of a sample that has an entry in all of the smoothed image: of its own color, and in its neighbors'."""
+    weight = float(1.0)
+    for direction in range(4):
+        share = shares[entry, direction]
+        if share[1] > 0.0:
+            other_entry = entries[neighbor(sample, direction, width)]
+            back = opposite(direction)
+            weight -= share[0] * _area_weight(shares[entry], direction)
+            weight += shares[other_entry, back][0] * _area_weight(shares[other_entry], back)
+    return weight
+
+
 @functools.cache
 def _make_blend(dtype: type) -> wp.Kernel:
     """Make the kernel for images of a dtype."""

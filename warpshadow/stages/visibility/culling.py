@@ -21,6 +21,10 @@ BOUND_MARGIN = 1.001 + BLEND
 """Bounds are so much larger: cones of receivers as near as BLEND are wider than the sphere, and there is rounding."""
 
 
+FOOTPRINT_SHARE = wp.constant(5.0 / 12.0)
+"""Squared half-width of a smoothstep over the area of a square, where a mean over the square has the same variance."""
+
+
 @wp.struct
 class DirectionCells:
     """Cells of directions and the cones around bundles of them, as kernels see them."""
@@ -33,15 +37,17 @@ class DirectionCells:
 
 
 @cached_by_values
-def make_cells(directions: np.ndarray, softness: float, device: wp.Device) -> DirectionCells:
-    """Make cells with the cones around their bundles, and the width of the falloff.
+def make_cells(
+    directions: np.ndarray, softness: float, device: wp.Device, has_footprints: bool = False
+) -> DirectionCells:
+    """Make cells with the cones around their bundles, and the width of the falloff, which footprints may widen to 60°.
 
     Raises:
         ValueError: for directions for which there are no cells, and for too soft a falloff.
     """
     check_directions(directions)
     width = falloff_width(softness, len(directions))
-    axes, cosine, sine = bundle_cones(directions, width)
+    axes, cosine, sine = bundle_cones(directions, max(width, np.pi / 3) if has_footprints else width)
     cells = DirectionCells()
     cells.directions = constant(directions, wp.vec3, device)
     cells.axes = constant(axes, wp.vec3, device)
@@ -60,6 +66,8 @@ def cap_type(lanes: int) -> Any:
         axis: Vectors
         cosine: Lane  # of the half-angle θ + w
         sine: Lane
+        cos_width: Lane  # of w
+        sin_width: Lane
 
     return Cap
 
@@ -67,23 +75,52 @@ def cap_type(lanes: int) -> Any:
 class CapFunctions(NamedTuple):
     """Kernel functions on caps."""
 
-    widen_cone: wp.Function  # cones by w: axis, cosine and sine of θ, cells → caps
+    widen_cone: wp.Function  # cones by w: axis, cosine and sine of θ, d², receivers, cells → caps
+    spread: (
+        wp.Function
+    )  # sin²w of receivers at distances d from the edges of shadows, past that of cells: d², receivers
     reaches_bundle: wp.Function  # whether a cap reaches a bundle for any receiver
     is_above_horizon: wp.Function  # whether a cap rises above the horizon of any receiver
     soft_edge: wp.Function  # direction, cap, 1/(hi−lo) → t in the falloff, and its smoothstep
 
 
 @functools.cache
-def make_cap_functions(has_horizon: bool, lanes: int) -> CapFunctions:
+def make_cap_functions(has_horizon: bool, lanes: int, has_footprints: bool = False) -> CapFunctions:
     """Make the kernel functions for a number of lanes."""
     Lane, Vectors, Cap = lane_type(lanes), vectors_type(lanes), cap_type(lanes)
+    ReceiverLanes = receiver_lanes_type(lanes)
     fn = make_lane_functions(lanes)
-    is_any_above, dot, dot_direction, smoothstep = fn.is_any_above, fn.dot, fn.dot_direction, fn.smoothstep
+    sqrt, is_any_above, dot, dot_direction, smoothstep = (
+        fn.sqrt,
+        fn.is_any_above,
+        fn.dot,
+        fn.dot_direction,
+        fn.smoothstep,
+    )
 
     @wp.func(inline=True)
-    def widen_cone(axis: Vectors, cosine: Lane, sine: Lane, cells: DirectionCells):
-        cap_cosine = cells.cos_width * cosine - cells.sin_width * sine
-        return Cap(axis, cap_cosine, cells.sin_width * cosine + cells.cos_width * sine)
+    def spread(squared_distance: Lane, receivers: ReceiverLanes):
+        squared_width = FOOTPRINT_SHARE * receivers.footprints
+        return wp.cw_div(squared_width, wp.max(squared_distance + 2.0 * squared_width, Lane(1.0e-37)))
+
+    @wp.func(inline=True)
+    def widen_cone(
+        axis: Vectors,
+        cosine: Lane,
+        sine: Lane,
+        squared_distance: Lane,
+        receivers: ReceiverLanes,
+        cells: DirectionCells,
+    ):
+        cos_width = Lane(cells.cos_width)
+        sin_width = Lane(cells.sin_width)
+        if wp.static(has_footprints):
+            squared_sine = Lane(cells.sin_width * cells.sin_width) + spread(squared_distance, receivers)
+            sin_width = sqrt(squared_sine)
+            cos_width = sqrt(Lane(1.0) - squared_sine)
+        cap_cosine = wp.cw_mul(cos_width, cosine) - wp.cw_mul(sin_width, sine)
+        cap_sine = wp.cw_mul(sin_width, cosine) + wp.cw_mul(cos_width, sine)
+        return Cap(axis, cap_cosine, cap_sine, cos_width, sin_width)
 
     @wp.func(inline=True)
     def reaches_bundle(cap: Cap, axis: wp.vec3, half_angle: wp.vec2):
@@ -106,7 +143,7 @@ def make_cap_functions(has_horizon: bool, lanes: int) -> CapFunctions:
         t = wp.min(wp.max(t, Lane(0.0)), Lane(1.0))
         return t, smoothstep(t)
 
-    return CapFunctions(widen_cone, reaches_bundle, is_above_horizon, soft_edge)
+    return CapFunctions(widen_cone, spread, reaches_bundle, is_above_horizon, soft_edge)
 
 
 @functools.cache
@@ -126,7 +163,7 @@ def make_is_bundle_above(has_horizon: bool, lanes: int) -> wp.Function:
 
 
 @functools.cache
-def make_cull(has_horizon: bool, Task: type, lanes: int) -> wp.Function:
+def make_cull(has_horizon: bool, Task: type, lanes: int, has_footprints: bool = False) -> wp.Function:
     """Make the kernel function that lists the bundles of directions that spheres can reach, for the traversal.
 
     Args:
@@ -143,7 +180,7 @@ def make_cull(has_horizon: bool, Task: type, lanes: int) -> wp.Function:
     Lane, ReceiverLanes = lane_type(lanes), receiver_lanes_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, is_any_above, dot, offset, scale = fn.sqrt, fn.is_any_above, fn.dot, fn.offset, fn.scale
-    widen_cone, reaches_bundle, is_above_horizon, _soft_edge = make_cap_functions(has_horizon, lanes)
+    widen_cone, _, reaches_bundle, is_above_horizon, _ = make_cap_functions(has_horizon, lanes, has_footprints)
 
     @wp.func
     def cull(receivers: ReceiverLanes, bound: wp.vec4, traversal_index: int, candidates: int, task: Task):
@@ -158,7 +195,8 @@ def make_cull(has_horizon: bool, Task: type, lanes: int) -> wp.Function:
             inverse = wp.cw_div(Lane(1.0), wp.max(distance, Lane(bound_radius)))
             sine = bound_radius * inverse
             cosine = sqrt(Lane(1.0) - wp.cw_mul(sine, sine))
-            cap = widen_cone(scale(inverse, bound_offset), cosine, sine, cells)
+            gap = wp.max(distance - Lane(bound_radius), Lane(0.0))  # no edge of a shadow is nearer
+            cap = widen_cone(scale(inverse, bound_offset), cosine, sine, wp.cw_mul(gap, gap), receivers, cells)
             if is_within or is_above_horizon(cap, receivers.normals):
                 candidate_count = candidates
                 if candidates == ALL_BUNDLES:

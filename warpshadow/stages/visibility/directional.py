@@ -6,6 +6,13 @@ falloff, and the opacity A makes up for that: the blocked solid angle is exactly
     T_q(x) = Π_i (1 − A_i smoothstep((u_i·ω_q − lo_i) / (hi_i − lo_i)))
     lo = cos(θ+w),  hi = cos(max(θ−w, 0)),  A = min(1, (1 − cos θ) / (1 − (hi+lo)/2)),  w = κ·ρ,  ρ = 2/√Q
 
+A receiver that stands for an area f² sees the mean over it: an edge at distance d moves by an angle of f/d, so
+
+    sin²w = sin²κρ + 5/12 f² / (d² + 5/6 f²),   d² = D² − r²
+
+5/12: then a smoothstep has the variance of the mean over a square; 5/6 f² keeps w below 45° where κρ is small. Without
+it an edge narrower than a pixel, as a sun's at the foot of a body, has a derivative at few receivers, and a huge one.
+
 There is no band limit, so no ringing; T stays in [0, 1] however many spheres overlap; tiny spheres block as much as
 they should; and the falloff has a smooth gradient.
 """
@@ -16,6 +23,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warpshadow import check
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, span_count
 from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
@@ -29,7 +37,7 @@ from warpshadow.stages.visibility.culling import (
     make_cull,
     make_is_bundle_above,
 )
-from warpshadow.stages.visibility.falloff import make_cap_adjoint, make_falloff
+from warpshadow.stages.visibility.falloff import make_cap_adjoint, make_falloff, make_squared_edge_distance
 from warpshadow.stages.visibility.merging import MERGING, NODES_PER_CLUSTER, Gradients
 from warpshadow.stages.visibility.traversal import (
     ClusterTree,
@@ -66,10 +74,10 @@ def _task_type(lanes: int) -> Any:
 
 
 @functools.cache
-def _make_load_task(has_horizon: bool, lanes: int) -> wp.Function:
+def _make_load_task(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.Function:
     """Make the kernel function that loads the receivers and directions of a thread."""
     Lane, TransmittanceTask = lane_type(lanes), _task_type(lanes)
-    load_receivers = make_load_receivers(has_horizon, lanes)
+    load_receivers = make_load_receivers(has_horizon, lanes, has_footprints)
 
     @wp.func(inline=lanes == 1)
     def load_task(
@@ -114,22 +122,27 @@ def _make_attenuate(lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
+def _make_transmit(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.Kernel:
     Lane, TransmittanceTask = lane_type(lanes), _task_type(lanes)
     ReceiverLanes, SphereView = receiver_lanes_type(lanes), sphere_view_type(lanes)
     store_columns, sqrt = make_lane_functions(lanes).store_columns, make_lane_functions(lanes).sqrt
     is_bundle_above = make_is_bundle_above(has_horizon, lanes)
-    load_task, falloff, attenuate = _make_load_task(has_horizon, lanes), make_falloff(lanes), _make_attenuate(lanes)
-    widen_cone, reaches_bundle, is_above_horizon, _soft_edge = make_cap_functions(has_horizon, lanes)
+    load_task = _make_load_task(has_horizon, has_footprints, lanes)
+    falloff, attenuate, squared_edge_distance = (
+        make_falloff(lanes),
+        _make_attenuate(lanes),
+        make_squared_edge_distance(lanes),
+    )
+    widen_cone, _, reaches_bundle, is_above_horizon, _ = make_cap_functions(has_horizon, lanes, has_footprints)
 
     @wp.func(inline=True)
     def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: TransmittanceTask):
         cone = sphere_view.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
-        cap = widen_cone(cone.axis, cone.cosine, sine, cells)
+        cap = widen_cone(cone.axis, cone.cosine, sine, squared_edge_distance(sphere_view), receivers, cells)
         if is_above_horizon(cap, receivers.normals):
-            slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
+            slope, opacity = falloff(cone, sine, cap.cosine, cap.cos_width, cap.sin_width)
             for k in range(count):
                 bundle = task.reached_bundles[1, k]
                 direction_bundle = task.first_bundle + bundle
@@ -139,7 +152,8 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
                 if is_candidate and not attenuate(cap, slope, opacity, bundle, task):
                     task.ends[bundle] = sphere_view.traversal_index + 1
 
-    traverse = make_traversal(make_cull(has_horizon, TransmittanceTask, lanes), visit, TransmittanceTask, False, lanes)
+    cull = make_cull(has_horizon, TransmittanceTask, lanes, has_footprints)
+    traverse = make_traversal(cull, visit, TransmittanceTask, False, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def transmit(
@@ -173,12 +187,12 @@ def _make_transmit(has_horizon: bool, lanes: int) -> wp.Kernel:
 
 
 @functools.cache
-def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
+def _make_transmit_adjoint(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.Kernel:
     Lane, TransmittanceTask = lane_type(lanes), _task_type(lanes)
     ReceiverLanes, SphereView, _SphereAdjoint = lane_structs(lanes)
     fn = make_lane_functions(lanes)
     load_columns, multiply_by_columns, add_vectors = fn.load_columns, fn.multiply_by_columns, fn.add_vectors
-    load_task = _make_load_task(has_horizon, lanes)
+    load_task = _make_load_task(has_horizon, has_footprints, lanes)
 
     @wp.func(inline=True)
     def find_weight(sphere_view: SphereView, task: TransmittanceTask):
@@ -192,14 +206,17 @@ def _make_transmit_adjoint(has_horizon: bool, lanes: int) -> wp.Kernel:
         """ā_i = −T̄ T / (1 − a_i)."""
         return -wp.cw_div(task.transmittances[slot], wp.max(Lane(1.0) - share, Lane(1.0e-7)))
 
-    cap_adjoint = make_cap_adjoint(has_horizon, find_weight, share_adjoint, False, TransmittanceTask, lanes)
+    cap_adjoint = make_cap_adjoint(
+        has_horizon, find_weight, share_adjoint, False, TransmittanceTask, lanes, has_footprints
+    )
 
     @wp.func(inline=True)
     def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: TransmittanceTask):
         adj_sphere, _relative_adjoint = cap_adjoint(receivers, sphere_view, count, task)
         return adj_sphere
 
-    traverse = make_traversal(make_cull(has_horizon, TransmittanceTask, lanes), visit, TransmittanceTask, True, lanes)
+    cull = make_cull(has_horizon, TransmittanceTask, lanes, has_footprints)
+    traverse = make_traversal(cull, visit, TransmittanceTask, True, lanes)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def transmit_adjoint(
@@ -245,6 +262,7 @@ def transmittance(
     merging: float = MERGING,
     skip: tuple[int, int] = (0, 0),
     clusters: ClusterTree | None = None,
+    footprints: wp.array | None = None,
 ) -> wp.array:
     """Transmittance of spheres towards cells of directions.
 
@@ -260,19 +278,24 @@ def transmittance(
             :mod:`warpshadow.stages.visibility.merging`), where there are 512 or more; 0 for never.
         skip: Spheres that are left out: the first, and the one after the last.
         clusters: Of these spheres, from :func:`.traversal.find_clusters`, where they are found already.
+        footprints: Areas f² for which receivers stand, as the light sees them [scene units²], float32 of shape [batch,
+            vertex], by which the falloff is wider; None where receivers are points.
     Returns:
         Transmittance in [0, 1], float32 of shape [batch, vertex, direction].
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii. (That waits for the device. While a CUDA graph
             is captured, nothing is checked.)
     Differentiable: points, centers, radii. Not: normals (they only cull), directions, softness, merging, skip,
-    clusters.
+    clusters, footprints.
     """
-    cells = make_cells(directions, softness, points.device)
+    cells = make_cells(directions, softness, points.device, footprints is not None)
     inputs, nodes, lanes, row_count = prepare_traversal(
         points, normals, centers, radii, cell_radius(len(directions)), merging=merging, skip=skip, clusters=clusters
     )
-    device, traits = points.device, (normals is not None, lanes)
+    if footprints is not None:
+        check.shape("footprints", footprints.shape, points.shape)
+        inputs.footprints = footprints
+    device, traits = points.device, (normals is not None, footprints is not None, lanes)
     spans = span_count(device, len(directions))
     bundle_count = len(directions) // (BUNDLE * spans)
     ends = empty((row_count, spans, bundle_count), dtype=wp.int32, device=device)

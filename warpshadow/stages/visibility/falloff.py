@@ -7,7 +7,7 @@ import warp as wp
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.maths.directions import BUNDLE
 from warpshadow.stages.visibility.cones import cone_type, make_cone_adjoint
-from warpshadow.stages.visibility.culling import cap_type, make_cap_functions
+from warpshadow.stages.visibility.culling import FOOTPRINT_SHARE, cap_type, make_cap_functions
 from warpshadow.stages.visibility.traversal import lane_structs, sphere_view_type
 
 
@@ -18,9 +18,9 @@ def make_falloff(lanes: int) -> wp.Function:
     sqrt = make_lane_functions(lanes).sqrt
 
     @wp.func(inline=True)
-    def falloff(cone: Cone, sine: Lane, low: Lane, cos_width: float, sin_width: float):
+    def falloff(cone: Cone, sine: Lane, low: Lane, cos_width: Lane, sin_width: Lane):
         # cos(max(θ − w, 0)): where θ < w the sine of the difference is cut off at 0
-        inner_sine = wp.max(cos_width * sine - sin_width * cone.cosine, Lane(0.0))
+        inner_sine = wp.max(wp.cw_mul(cos_width, sine) - wp.cw_mul(sin_width, cone.cosine), Lane(0.0))
         high = sqrt(Lane(1.0) - wp.cw_mul(inner_sine, inner_sine))
         slope = wp.cw_div(Lane(1.0), high - low)
         solid_angle = wp.cw_div(cone.sine2, Lane(1.0) + cone.cosine)
@@ -32,7 +32,8 @@ def make_falloff(lanes: int) -> wp.Function:
 
 @functools.cache
 def make_falloff_adjoint(lanes: int) -> wp.Function:
-    """Make the adjoint of :func:`make_falloff`'s function → adjoints of cos θ, sin²θ and the weight.
+    """Make the adjoint of :func:`make_falloff`'s function → adjoints of cos θ, sin²θ, the weight, cos w
+    and sin w.
 
     With k = 1 − cos θ the solid angle over 2π, h = 1 − (hi+lo)/2, g = k/h and m = min(1, g):
 
@@ -47,13 +48,13 @@ def make_falloff_adjoint(lanes: int) -> wp.Function:
         cone: Cone,
         sine: Lane,
         low: Lane,
-        cos_width: float,
-        sin_width: float,
+        cos_width: Lane,
+        sin_width: Lane,
         adj_low: Lane,
         adj_high: Lane,
         adj_opacity: Lane,
     ):
-        inner_sine = wp.max(cos_width * sine - sin_width * cone.cosine, Lane(0.0))
+        inner_sine = wp.max(wp.cw_mul(cos_width, sine) - wp.cw_mul(sin_width, cone.cosine), Lane(0.0))
         high = sqrt(Lane(1.0) - wp.cw_mul(inner_sine, inner_sine))
         inverse = wp.cw_div(Lane(1.0), Lane(1.0) - 0.5 * (high + low))
         share = wp.cw_mul(wp.cw_div(cone.sine2, Lane(1.0) + cone.cosine), inverse)
@@ -64,10 +65,12 @@ def make_falloff_adjoint(lanes: int) -> wp.Function:
         total_adj_low = adj_low + adj_bound
         total_adj_high = adj_high + adj_bound
         adj_inner_sine = -wp.cw_div(wp.cw_mul(total_adj_high, inner_sine), high)
-        adj_cosine = cos_width * total_adj_low - sin_width * adj_inner_sine - adj_solid_angle
-        adj_sine = cos_width * adj_inner_sine - sin_width * total_adj_low
+        adj_cosine = wp.cw_mul(cos_width, total_adj_low) - wp.cw_mul(sin_width, adj_inner_sine) - adj_solid_angle
+        adj_sine = wp.cw_mul(cos_width, adj_inner_sine) - wp.cw_mul(sin_width, total_adj_low)
+        adj_cos_width = wp.cw_mul(cone.cosine, total_adj_low) + wp.cw_mul(sine, adj_inner_sine)
+        adj_sin_width = -wp.cw_mul(sine, total_adj_low) - wp.cw_mul(cone.cosine, adj_inner_sine)
         adj_sine2 = wp.cw_div(0.5 * adj_sine, wp.max(sine, Lane(1.0e-18)))
-        return adj_cosine, adj_sine2, adj_weight
+        return adj_cosine, adj_sine2, adj_weight, adj_cos_width, adj_sin_width
 
     return adjoint
 
@@ -81,7 +84,8 @@ def make_sphere_adjoint(lanes: int) -> wp.Function:
         Ā = Σ ā step,  Σ t̄,  Σ t̄ t,  Σ t̄ ω,  where t̄ = ā A 6t(1−t)
 
     in variables of its own: in a struct they cost a fifth of the kernel's time on a CPU. The function is: the sphere,
-    sin θ, lo, cosine and sine of w, the slope, these sums → adjoints of offset, radius and the cone's weight. In it
+    sin θ, lo, cosine and sine of w, the slope, these sums → adjoints of offset, radius, the cone's weight,
+    cos w and sin w. In it
 
         ū = slope Σ t̄ ω,  lō = slope (Σ t̄ t − Σ t̄),  hī = −slope Σ t̄ t
     """
@@ -94,15 +98,15 @@ def make_sphere_adjoint(lanes: int) -> wp.Function:
         sphere_view: SphereView,
         sine: Lane,
         low: Lane,
-        cos_width: float,
-        sin_width: float,
+        cos_width: Lane,
+        sin_width: Lane,
         slope: Lane,
         adj_opacity: Lane,
         sum_adj_t: Lane,
         sum_t: Lane,
         sum_omega: Vectors,
     ):
-        adj_cosine, adj_sine2, adj_weight = falloff_adjoint(
+        adj_cosine, adj_sine2, adj_weight, adj_cos_width, adj_sin_width = falloff_adjoint(
             sphere_view.cone,
             sine,
             low,
@@ -114,14 +118,33 @@ def make_sphere_adjoint(lanes: int) -> wp.Function:
         )
         adj_cone = Cone(scale(slope, sum_omega), adj_cosine, adj_sine2, wp.cw_mul(adj_weight, sphere_view.share))
         adj_offset, adj_radius = cone_adjoint(sphere_view.offset, sphere_view.curvature, sphere_view.cone, adj_cone)
-        return adj_offset, adj_radius, adj_weight
+        return adj_offset, adj_radius, adj_weight, adj_cos_width, adj_sin_width
 
     return sphere_adjoint
 
 
 @functools.cache
+def make_squared_edge_distance(lanes: int) -> wp.Function:
+    """Make the kernel function of the squared distance D² − r² to the circle at which rays touch a sphere, 0 within."""
+    Lane, SphereView, dot = lane_type(lanes), sphere_view_type(lanes), make_lane_functions(lanes).dot
+
+    @wp.func(inline=True)
+    def squared_edge_distance(sphere_view: SphereView):
+        squared_radius = 1.0 / (sphere_view.curvature * sphere_view.curvature)
+        return wp.max(dot(sphere_view.offset, sphere_view.offset) - Lane(squared_radius), Lane(0.0))
+
+    return squared_edge_distance
+
+
+@functools.cache
 def make_cap_adjoint(
-    has_horizon: bool, find_weight: wp.Function, share_adjoint: wp.Function, is_costly: bool, Task: type, lanes: int
+    has_horizon: bool,
+    find_weight: wp.Function,
+    share_adjoint: wp.Function,
+    is_costly: bool,
+    Task: type,
+    lanes: int,
+    has_footprints: bool = False,
 ) -> wp.Function:
     """Make the kernel function of the adjoint of all cells that a sphere blocks in part, for the traversal's visits.
 
@@ -133,6 +156,7 @@ def make_cap_adjoint(
         is_costly: Whether that costs more than the test for cells of which the sphere blocks nothing.
         Task: Struct as for :func:`.culling.make_cull`.
         lanes: Receivers of a block.
+        has_footprints: Whether receivers have footprints.
 
     Returns:
         The function (receivers, sphere_view, count, task) → SphereAdjoint, and Σ ā a.
@@ -140,9 +164,11 @@ def make_cap_adjoint(
     Lane, Vectors, Cap = lane_type(lanes), vectors_type(lanes), cap_type(lanes)
     ReceiverLanes, SphereView, SphereAdjoint = lane_structs(lanes)
     fn = make_lane_functions(lanes)
-    sqrt, is_any_above = fn.sqrt, fn.is_any_above
+    sqrt, is_any_above, scale, add = fn.sqrt, fn.is_any_above, fn.scale, fn.add
     falloff, sphere_adjoint = make_falloff(lanes), make_sphere_adjoint(lanes)
-    widen_cone, reaches_bundle, is_above_horizon, soft_edge = make_cap_functions(has_horizon, lanes)
+    cap_functions = make_cap_functions(has_horizon, lanes, has_footprints)
+    widen_cone, spread, reaches_bundle, is_above_horizon, soft_edge = cap_functions
+    squared_edge_distance = make_squared_edge_distance(lanes)
 
     @wp.func(inline=True)
     def is_looked_at(t: Lane):
@@ -194,27 +220,41 @@ def make_cap_adjoint(
         cone = sphere_view.cone
         cells = task.cells
         sine = sqrt(cone.sine2)
-        cap = widen_cone(cone.axis, cone.cosine, sine, cells)
+        squared_distance = squared_edge_distance(sphere_view)
+        cap = widen_cone(cone.axis, cone.cosine, sine, squared_distance, receivers, cells)
         relative_adjoint = Lane(0.0)
         if is_above_horizon(cap, receivers.normals):
-            slope, opacity = falloff(cone, sine, cap.cosine, cells.cos_width, cells.sin_width)
+            slope, opacity = falloff(cone, sine, cap.cosine, cap.cos_width, cap.sin_width)
             weight = find_weight(sphere_view, task)
             is_any_blocked, adj_opacity, sum_adj_t, sum_t, sum_omega = sum_over_cells(
                 sphere_view, cap, slope, opacity, weight, count, task
             )
             if is_any_blocked:
-                adj_offset, adj_radius, adj_weight = sphere_adjoint(
+                adj_offset, adj_radius, adj_weight, adj_cos_width, adj_sin_width = sphere_adjoint(
                     sphere_view,
                     sine,
                     cap.cosine,
-                    cells.cos_width,
-                    cells.sin_width,
+                    cap.cos_width,
+                    cap.sin_width,
                     slope,
                     adj_opacity,
                     sum_adj_t,
                     sum_t,
                     sum_omega,
                 )
+                if wp.static(has_footprints):
+                    # sin²w = sin²w₀ + s, s = f/(d² + 2f), d² = D² − r²
+                    adj_spread = 0.5 * (
+                        wp.cw_div(adj_sin_width, cap.sin_width) - wp.cw_div(adj_cos_width, cap.cos_width)
+                    )
+                    distance_slope = wp.cw_div(
+                        spread(squared_distance, receivers),
+                        wp.max(squared_distance + (2.0 * FOOTPRINT_SHARE) * receivers.footprints, Lane(1.0e-37)),
+                    )
+                    is_outside = wp.min(wp.max(1.0e30 * squared_distance, Lane(0.0)), Lane(1.0))
+                    adj_squared_distance = -wp.cw_mul(is_outside, wp.cw_mul(adj_spread, distance_slope))
+                    adj_offset = add(adj_offset, scale(2.0 * adj_squared_distance, sphere_view.offset))
+                    adj_radius -= (2.0 / sphere_view.curvature) * adj_squared_distance
                 adj_sphere.is_any = True
                 adj_sphere.offset = adj_offset
                 adj_sphere.radius = adj_radius

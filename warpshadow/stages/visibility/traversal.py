@@ -118,6 +118,7 @@ class TraversalInputs:
 
     points: wp.array2d(dtype=wp.vec3)
     normals: wp.array2d(dtype=wp.vec3)  # empty where there is no horizon
+    footprints: wp.array2d(dtype=wp.float32)  # empty where receivers are points
     spheres: SphereClusters
 
 
@@ -178,16 +179,17 @@ def receiver_lanes_type(lanes: int) -> Any:
     class ReceiverLanes:
         points: Vectors
         normals: Vectors  # 0 where there is no horizon
+        footprints: wp.types.vector(length=lanes, dtype=wp.float32)  # 0 where they are points
 
     return ReceiverLanes
 
 
 @functools.cache
-def make_load_receivers(has_horizon: bool, lanes: int) -> wp.Function:
+def make_load_receivers(has_horizon: bool, lanes: int, has_footprints: bool = False) -> wp.Function:
     """Make the kernel function that loads a block of receivers: inputs, row → instance, block, receivers."""
-    Vectors, ReceiverLanes = vectors_type(lanes), receiver_lanes_type(lanes)
+    Lane, Vectors, ReceiverLanes = lane_type(lanes), vectors_type(lanes), receiver_lanes_type(lanes)
     fn = make_lane_functions(lanes)
-    find_block, load = fn.find_block, fn.load
+    find_block, load, load_numbers = fn.find_block, fn.load, fn.load_numbers
 
     @wp.func(inline=True)
     def load_receivers(inputs: TraversalInputs, row: int):
@@ -195,7 +197,10 @@ def make_load_receivers(has_horizon: bool, lanes: int) -> wp.Function:
         normals = Vectors()
         if wp.static(has_horizon):
             normals = load(inputs.normals[batch], block)
-        return batch, block, ReceiverLanes(load(inputs.points[batch], block), normals)
+        footprints = Lane()
+        if wp.static(has_footprints):
+            footprints = load_numbers(inputs.footprints[batch], block)
+        return batch, block, ReceiverLanes(load(inputs.points[batch], block), normals, footprints)
 
     return load_receivers
 
