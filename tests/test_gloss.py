@@ -315,6 +315,13 @@ TILES = dataclasses.replace(GROUND, roughness=0.4, metallic=0.6)
 """A ground with uvs that shines."""
 
 
+def test_stills_of_many_samples_widen_lobes_for_the_normals_within_a_sample():
+    ball = ws.Body(ws.icosphere(1.0, 2), (0.9, 0.7, 0.4), roughness=0.2, metallic=1.0)
+    scene = ws.Scene([ball], ws.synthetic_sky((0.3, 0.5, 0.8)), ws.Camera.framing(ball, size=(24, 24)))
+    still, truth = (ws.render(dataclasses.replace(scene, supersampling=count))[..., :3] for count in (4, 12))
+    assert np.linalg.norm(still - truth) < 0.03 * np.linalg.norm(truth)
+
+
 def test_a_metal_in_a_still_has_no_grain_where_it_mirrors_the_ground(monkeypatch):
     """The light of blockers and their share of the hemisphere are found by the same rays, whose noise cancels."""
     ball = ws.Body(ws.icosphere(1.0, 4), roughness=0.25, metallic=1.0, translation=(0, 1, 0))

@@ -32,7 +32,7 @@ from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Receivers
-from warpshadow.stages.receivers.sample_receivers import Span, places_in_pixels
+from warpshadow.stages.receivers.sample_receivers import MAX_SHARED_SAMPLES, Span, places_in_pixels
 from warpshadow.stages.shell.beams import exits_from_shell
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.numbers import as_colors, as_scalars, average_over_receivers
@@ -145,8 +145,10 @@ class GlossyPoints(LitPoints):
         self, receivers: Receivers, normals: wp.array, positions: wp.array, cameras: wp.array, seen: Fragments
     ) -> NormalSpread:
         """Find how normals vary over the receivers. Differentiable: all but seen."""
-        # samples of a receiver, across
-        sharing = self.merged_scene.scene.supersampling // self.method.lobes.receivers_across
+        supersampling = self.merged_scene.scene.supersampling
+        sharing = supersampling // self.method.lobes.receivers_across  # samples of a receiver, across
+        if self.method.shares_directions and supersampling > MAX_SHARED_SAMPLES:
+            sharing = 1
         _, height, width = seen.face_ids.shape
         fragments, size = receivers.sample_fragments, (width // sharing, height // sharing)
         assert fragments is not None

@@ -15,11 +15,8 @@ from warpshadow.stages.image.slopes import find_mean_slopes
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
 from warpshadow.stages.receivers.footprints import find_footprints
+from warpshadow.stages.receivers.sample_receivers import MAX_SHARED_SAMPLES
 from warpshadow.stages.silhouettes.find import Silhouettes
-
-MAX_SHARED = 2
-"""Samples of a pixel across in stills up to which those on a smooth surface share a receiver: whoever asks for more
-wants edges and bumps within pixels resolved."""
 
 _MIN_SHARED_SIZE = 128
 """Pixels of the shorter side of stills from which they do: in smaller ones shadows are as thin as pixels. Crowds and
@@ -48,7 +45,7 @@ class ReceiverFinder:
         self._merged_scene = method.merged_scene
         self._separate_bodies = method.separate_bodies(blocker_kinds)
         self._supersampling = supersampling
-        self._may_share_surfaces = method.shares_directions and supersampling <= MAX_SHARED
+        self._may_share_surfaces = method.shares_directions and supersampling <= MAX_SHARED_SAMPLES
 
     def find(
         self,

@@ -12,7 +12,7 @@ c_edge − c over t, steps along a row add up to the color at the surface's righ
 derivative of the moving edges has the same with the other sign, and both cancel. For that a step to an edge moves with
 the edge's point, not the sample's; and a sample counts along a row with its extent there, ½ + t beside an edge, and so
 along a column, not with its weight in the smoothed image, which is that of one of both. (Else a ball of metal of
-roughness 0.2 before a sun has a gradient of −3500 where the slope of the image is 1300; so it has 1360.)
+roughness 0.2 before a sun has a gradient of −3500 where the slope of the image is 1300; so it has 1630.)
 
 Where another surface comes in front before the neighbor's center, or the image ends, the opposite half counts alone.
 Where all neighbors see the same face, the slope is the face's own.

@@ -29,6 +29,10 @@ MIN_SHARED_COSINE = 0.9  # cosine between normals of samples of a pixel from whi
 MAX_SHARED_SLOPE = 0.3
 """… where a line from one to the other is not steeper than that: the sine of its angle to the surface."""
 
+MAX_SHARED_SAMPLES = 2
+"""Samples of a pixel across in stills up to which those on a smooth surface share a receiver: whoever asks for more
+wants edges and bumps within pixels resolved."""
+
 _SHARING_COST, _SAMPLE_COST = 12.0, 3.5  # nanoseconds of a sample, to find whose receiver it shares and to get it
 
 
