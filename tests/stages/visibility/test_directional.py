@@ -90,6 +90,20 @@ def test_an_edge_moves_over_a_footprint_as_its_mean_over_a_square_does(device):
     assert abs(variance / (side**2 / 12) - 1) < 0.1
 
 
+@pytest.mark.parametrize("count", [32, 64])
+def test_a_bundle_that_footprints_alone_bring_into_reach_is_not_culled(count, device):
+    """They widen soft edges beyond 60° where these are wider than 30° without."""
+    directions = cells.fibonacci(count)
+    softness = 0.9 * np.pi / 4 / cells.cell_radius(count)
+    for axis in cells.bundle_cones(directions).axes:
+        point = np.float32(1.0001 * axis)[None]  # touches the sphere, which is opposite to the axis; alone in its group
+        footprints = wp.full((1, 1), 100.0, dtype=wp.float32, device=device)
+        options = {"softness": softness, "footprints": footprints}
+        got = transmittance(point, None, [[0, 0, 0]], [1.0], directions, device, **options)
+        expected = twins.transmittance(*wide(point, [[0, 0, 0]], [1.0]), directions, softness, 100.0)
+        assert np.abs(got - expected).max() < FLOAT32[64]
+
+
 @pytest.mark.parametrize("count", [64, 128])
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.95])
 def test_a_bundle_opposite_to_a_sphere_is_not_culled_where_the_soft_edge_reaches_it(count, share, device):

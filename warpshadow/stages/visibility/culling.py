@@ -40,14 +40,17 @@ class DirectionCells:
 def make_cells(
     directions: np.ndarray, softness: float, device: wp.Device, has_footprints: bool = False
 ) -> DirectionCells:
-    """Make cells with the cones around their bundles, and the width of the falloff, which footprints may widen to 60°.
+    """Make cells with the cones around their bundles, and the width w of the falloff.
+
+    Footprints add up to ½ to sin²w: widths of 30° become 60°, those of 45° 90°.
 
     Raises:
         ValueError: for directions for which there are no cells, and for too soft a falloff.
     """
     check_directions(directions)
     width = falloff_width(softness, len(directions))
-    axes, cosine, sine = bundle_cones(directions, max(width, np.pi / 3) if has_footprints else width)
+    max_width = np.arcsin(min(np.sqrt(np.sin(width) ** 2 + 0.5), 1.0)) if has_footprints else width
+    axes, cosine, sine = bundle_cones(directions, max_width)
     cells = DirectionCells()
     cells.directions = constant(directions, wp.vec3, device)
     cells.axes = constant(axes, wp.vec3, device)
