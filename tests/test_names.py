@@ -49,6 +49,7 @@ BANNED = {
     *("BeamAdjoint", "NearestBorder", "on_static"),
     *("placed_blockers", "ShellLight"),
     *("contact_density", "FLAT", "Fronts", "Rays", "TOLERANCES", "touching_points"),
+    *("BLEND_START", "BodyExtents", "GLOSS_METHODS", "positions_cycle"),
 }
 BANNED_EVERYWHERE = {
     *("bulging", "decide", "emitter_projection", "free_projection", "free_projection_of", "has_proxies", "in_words"),
@@ -65,7 +66,7 @@ BANNED_EVERYWHERE = {
     *("_find_numbers", "_lobe_cells", "_projected_from_scene", "_projected_if_given", "_REUSED", "_Same", "_shining"),
     *("_touching_points", "_towards", "_warn_of_nothing"),
     *("_ById", "_see_by", "DirectLightOfPortion", "lobe_sum", "projected_patches", "ProjectedPatches"),
-    *("total_grazing", "VisibilityOfPortion", "where_edges_are"),
+    *("shows_gloss", "total_grazing", "VisibilityOfPortion", "where_edges_are"),
 }
 """Replaced names of methods and fields, too, which were not to be understood even with their object's name."""
 BANNED_PARTS = {"asked", "kept", "meant", "most", "pull", "pulled", "said", "taken", "told", "wanted"}
@@ -149,6 +150,18 @@ def documented_arguments(docstring: str) -> Iterator[str]:
 
 def test_no_two_classes_have_one_name():
     counts = Counter(node.name for _, tree in trees() for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+    assert len(counts) > 200 and not [name for name, count in counts.items() if count > 1]
+
+
+def test_no_two_files_of_stages_have_public_functions_of_one_name():
+    functions = {
+        (path, node.name)
+        for path, tree in trees()
+        if path.startswith("stages")
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef) and not node.name.startswith("_")
+    }
+    counts = Counter(name for _, name in functions)
     assert len(counts) > 200 and not [name for name, count in counts.items() if count > 1]
 
 

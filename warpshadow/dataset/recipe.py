@@ -16,7 +16,7 @@ from warpshadow.scene import toml_tables
 from warpshadow.scene.random_scenes import Ranges
 from warpshadow.scene.scene import Bounces, Scene, check_bounces, check_supersampling
 from warpshadow.scene.toml_tables import Table
-from warpshadow.scene.visibility import AUTO, GLOSS_METHODS, Visibility
+from warpshadow.scene.visibility import AUTO, FULL_LIGHT_METHODS, Visibility
 
 Plain: TypeAlias = "dict[str, Plain] | list[Plain] | str | int | float | None"  # values that JSON has
 
@@ -96,10 +96,10 @@ class Recipe:
         if self.creased is not None and not (check.is_number(self.creased) and 0 <= self.creased <= 180):
             raise ValueError(f"creased: got {check.described(self.creased)}, expected degrees from 0 to 180")
         object.__setattr__(self, "visibility", self.visibility.with_method())
-        shows_all = self.visibility.method in (*GLOSS_METHODS, AUTO)
+        shows_all = self.visibility.method in (*FULL_LIGHT_METHODS, AUTO)
         for name in ("glossy", "radius"):
             if getattr(self.ranges, name) and not shows_all:
-                methods = ", ".join(map(repr, GLOSS_METHODS))
+                methods = ", ".join(map(repr, FULL_LIGHT_METHODS))
                 raise ValueError(
                     f"{name}: got {getattr(self.ranges, name)}, which {self.visibility.method!r} does not show, "
                     f"expected none, or method = one of {methods}"

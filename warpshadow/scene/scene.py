@@ -25,7 +25,7 @@ from warpshadow.scene.visibility import (
     DEFAULT_METHOD,
     DIRECTIONS,
     DIRECTIONS_OF_GLOSS,
-    GLOSS_METHODS,
+    FULL_LIGHT_METHODS,
     METHODS,
     NARROW_ROUGHNESS,
     Visibility,
@@ -229,22 +229,22 @@ class Scene:
     def _check_method(self) -> None:
         """Raise ValueError for bodies, light and bounces that the named method does not show."""
         glossy = next((body for body in self.bodies if body.is_glossy), None)
-        if glossy is not None and self.visibility.method not in (*GLOSS_METHODS, None):
+        if glossy is not None and self.visibility.method not in (*FULL_LIGHT_METHODS, None):
             raise ValueError(
                 f"roughness: got some for body {glossy.name!r}, which {self.visibility.method!r} does not show, "
-                f"expected None, or method = one of {', '.join(map(repr, GLOSS_METHODS))}"
+                f"expected None, or method = one of {', '.join(map(repr, FULL_LIGHT_METHODS))}"
             )
         emitter = next((body for body in self.bodies if body.is_emitter), None)
-        if emitter is not None and self.visibility.method not in (*GLOSS_METHODS, None):
+        if emitter is not None and self.visibility.method not in (*FULL_LIGHT_METHODS, None):
             raise ValueError(
                 f"emission: got some for body {emitter.name!r}, whose light {self.visibility.method!r} lacks, "
-                f"expected None, or method = one of {', '.join(map(repr, GLOSS_METHODS))}"
+                f"expected None, or method = one of {', '.join(map(repr, FULL_LIGHT_METHODS))}"
             )
         if self.shell is not None:
-            if self.visibility.method not in (*GLOSS_METHODS, None):
+            if self.visibility.method not in (*FULL_LIGHT_METHODS, None):
                 raise ValueError(
                     f"light: got a radius, which {self.visibility.method!r} does not know, expected a map without one, "
-                    f"or method = one of {', '.join(map(repr, GLOSS_METHODS))}"
+                    f"or method = one of {', '.join(map(repr, FULL_LIGHT_METHODS))}"
                 )
             check_bodies_within(self.bodies, self.shell)
         if self.bounces and self.visibility.method not in (*BOUNCE_METHODS, None):
@@ -281,7 +281,7 @@ class Scene:
     def methods(self) -> tuple[str, ...]:
         """Methods of visibility that show all that the scene has: gloss, emission and near light."""
         is_any = self.shell is None and not any(body.is_glossy or body.is_emitter for body in self.bodies)
-        return tuple(method for method in METHODS if is_any or method in GLOSS_METHODS)
+        return tuple(method for method in METHODS if is_any or method in FULL_LIGHT_METHODS)
 
     @property
     def direction_count(self) -> int:

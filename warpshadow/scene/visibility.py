@@ -28,7 +28,7 @@ class MethodTraits(NamedTuple):
     settings: tuple[str, ...]  # of a :class:`Visibility` that it reads
     has_spheres: bool = False  # whether these stand in for bodies
     finds_bounces: bool = True  # whether light may bounce
-    shows_gloss: bool = True  # whether bodies may shine
+    shows_all_light: bool = True  # whether bodies may shine or emit, and light may be near
     tuned: tuple[str, ...] = ()  # settings that tuning varies
 
 
@@ -37,7 +37,10 @@ METHOD_TRAITS = {
         ("directions", "softness", "merging", "self_shadows", "samples"), has_spheres=True, tuned=("directions",)
     ),
     "log-sh": MethodTraits(
-        ("merging", "self_shadows", "order", "log", "base"), has_spheres=True, shows_gloss=False, tuned=("log", "order")
+        ("merging", "self_shadows", "order", "log", "base"),
+        has_spheres=True,
+        shows_all_light=False,
+        tuned=("log", "order"),
     ),
     "none": MethodTraits(("order",), finds_bounces=False),
     "ray-traced": MethodTraits(("order", "samples", "sampling")),
@@ -46,7 +49,7 @@ METHOD_TRAITS = {
 METHODS = tuple(method for method in METHOD_TRAITS if method != AUTO)
 SPHERE_METHODS = tuple(method for method, traits in METHOD_TRAITS.items() if traits.has_spheres)
 BOUNCE_METHODS = tuple(method for method, traits in METHOD_TRAITS.items() if traits.finds_bounces)
-GLOSS_METHODS = tuple(method for method, traits in METHOD_TRAITS.items() if traits.shows_gloss)
+FULL_LIGHT_METHODS = tuple(method for method, traits in METHOD_TRAITS.items() if traits.shows_all_light)
 METHODS_OF_SETTING = {
     setting: tuple(method for method, traits in METHOD_TRAITS.items() if setting in traits.settings)
     for setting in dict.fromkeys(setting for traits in METHOD_TRAITS.values() for setting in traits.settings)

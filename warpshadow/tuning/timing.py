@@ -148,11 +148,11 @@ def whole_image(renderer: SceneRenderer) -> Callable[[], wp.array]:
     """
     poses = renderer.scene_poses()
     extent = np.abs(renderer.geometry().positions.numpy()).max() + np.linalg.norm(renderer.scene.camera.eye)
-    positions_cycle = itertools.cycle(
+    poses_cycle = itertools.cycle(
         replace(
             poses,
             translations=wp.array(poses.translations.numpy() + shift * extent, dtype=wp.vec3, device=renderer.device),
         )
         for shift in (1e-5, 2e-5)
     )
-    return lambda: renderer.draw(view=renderer.view(renderer.placed(next(positions_cycle))))
+    return lambda: renderer.draw(view=renderer.view(renderer.placed(next(poses_cycle))))

@@ -11,7 +11,7 @@ from warpshadow.stages.ray_traced.traced_transfer import trace_transfer
 from warpshadow.stages.rays.ray_packets import build_face_tree
 from warpshadow.stages.rays.ray_tracing import trace_shading
 from warpshadow.stages.shell.beams import check_within, exits_from_shell, exits_on_host
-from warpshadow.stages.shell.shell_transfer import KERNEL_RADIUS, shell_transfer
+from warpshadow.stages.shell.shell_transfer import SHELL_KERNEL_RADIUS, shell_transfer
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -46,7 +46,7 @@ def twin(points, normals, transmittance, patches=PATCHES):
         return factors
     towards = beams / lengths[..., None]
     radius = cell_radius(len(CELLS))
-    kernel = np.maximum(towards @ CELLS.T - np.cos(KERNEL_RADIUS * radius), 0) ** 2
+    kernel = np.maximum(towards @ CELLS.T - np.cos(SHELL_KERNEL_RADIUS * radius), 0) ** 2
     height = np.clip((normals @ CELLS.T) / radius / 2 + 0.5, 0, 1)
     horizon = (height**2 * (3 - 2 * height))[:, None]
     through = (kernel * np.minimum(transmittance[:, None], horizon)).sum(axis=2)

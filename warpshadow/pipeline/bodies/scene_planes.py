@@ -26,14 +26,14 @@ _CORNERS = 64  # directions in which the vertices of a body are sought that are 
 class GroupPlanes(NamedTuple):
     """Flat bodies around some receivers."""
 
-    planes: PlaneBlockers
+    blockers: PlaneBlockers
     frames: wp.array  # where they are, vec3 of shape [batch, 3 · plane]
     skip: int | None = None  # the one that the receivers are part of
 
     @property
     def blocking(self) -> set[int]:
         """Numbers of those that block the receivers' light."""
-        return set(self.planes.is_blocking) - {self.skip}
+        return set(self.blockers.is_blocking) - {self.skip}
 
 
 class ScenePlanes:

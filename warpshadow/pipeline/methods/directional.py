@@ -36,7 +36,7 @@ from warpshadow.stages.planes.coverage import plane_coverage
 from warpshadow.stages.planes.partial_cells import coverage_of_light
 from warpshadow.stages.raster.sides import split_sides
 from warpshadow.stages.rays.ray_tracing import trace_cells
-from warpshadow.stages.receivers.footprints import find_seen_areas
+from warpshadow.stages.receivers.receiver_footprints import find_seen_areas
 from warpshadow.stages.self_visibility.gather import multiply_transmittances
 from warpshadow.stages.self_visibility.sun_cells import trace_sun_cells
 from warpshadow.stages.visibility import directional
@@ -206,12 +206,14 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
             "skip": planes.skip,
         }
         covered = self._coverages(
-            functools.partial(plane_coverage, points, planes.frames, planes.planes, **options), projected_light
+            functools.partial(plane_coverage, points, planes.frames, planes.blockers, **options), projected_light
         )
-        if projected_light.samples is not None and planes.planes.has_holes:
+        if projected_light.samples is not None and planes.blockers.has_holes:
             cells = projected_light.blocking_directions, projected_light.samples
             covered = covered._replace(
-                all_cells=coverage_of_light(points, covered.all_cells, planes.frames, planes.planes, *cells, **options)
+                all_cells=coverage_of_light(
+                    points, covered.all_cells, planes.frames, planes.blockers, *cells, **options
+                )
             )
         total = self._past_coverages(
             visibility.transmittance_self_and_spheres, covered, visibility.part_coverages, projected_light

@@ -15,7 +15,7 @@ from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT
 from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.light.shading import shade_cells
 from warpshadow.stages.planes.coverage import plane_coverage
-from warpshadow.stages.receivers.footprints import find_seen_areas
+from warpshadow.stages.receivers.receiver_footprints import find_seen_areas
 from warpshadow.stages.visibility import directional
 from warpshadow.stages.visibility.sharp_cells import SharpCells
 
@@ -86,7 +86,9 @@ def find_share_of_sharpest_light(
     if planes is not None and group.is_blocked_by_planes:
         front_weights, points = group.fronts_of_planes
         options: dict[str, Any] = {"radius": edge_radius, "horizon_normals": normals, "front_weights": front_weights}
-        coverages.append(plane_coverage(points, planes.frames, planes.planes, directions, skip=planes.skip, **options))
+        coverages.append(
+            plane_coverage(points, planes.frames, planes.blockers, directions, skip=planes.skip, **options)
+        )
     if coverages:
         transmittance = transmittance_past(transmittance, *coverages)
     lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]

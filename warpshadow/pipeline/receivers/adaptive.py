@@ -17,8 +17,8 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.receivers.lit_points import VisibleSurfaces
 from warpshadow.stages.receivers.find import points_of_fragments
-from warpshadow.stages.receivers.footprints import find_footprints
 from warpshadow.stages.receivers.quadtree import Quadtree, find_quadtree, probe_grid
+from warpshadow.stages.receivers.receiver_footprints import find_receiver_footprints
 from warpshadow.stages.receivers.sample_receivers import fragments_of_samples
 
 
@@ -32,7 +32,7 @@ def find_squares(
     Args:
         place_blockers: Places blockers, given the vertices, and the spheres.
         share_of_sharpest_light: Finds the share of the unblocked light of a group that comes from the cells with the
-            sharpest shadows, shape [batch, receiver]; None where no shadow is sharp.
+            sharpest shadows, shape [batch, receiver]; None where nothing blocks.
         surfaces: The samples, and the bodies; no gradient passes to them.
     """
     positions, normals, fragments, spheres, is_adaptive, supersampling, clip_positions, footprint_widths = surfaces
@@ -56,7 +56,7 @@ def find_squares(
             points_and_normals = points_of_fragments(positions, normals, merged_scene.faces, seen)
             shape = points_and_normals[0].shape
             arguments = seen, merged_scene.faces, footprint_widths, positions, clip_positions, size, shape
-            group = blockers.around_plane(*points_and_normals, find_footprints(*arguments), body)
+            group = blockers.around_plane(*points_and_normals, find_receiver_footprints(*arguments), body)
             portions = [share_of_sharpest_light(portion) for portion in group.portions()]
             known = [portion for portion in portions if portion is not None]
             if known:

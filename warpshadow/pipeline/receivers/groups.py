@@ -31,7 +31,7 @@ from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 RECEIVERS_AT_ONCE = 1 << 13  # receivers of each instance that are lit at once where no gradient is asked for
 
 
-class BodyExtents:
+class BodySides:
     """On which side of planes each body lies, by its farthest vertices; found once for all groups.
 
     Args:
@@ -65,7 +65,7 @@ class OwnBody:
     lookup: Any  # traced self-visibility, of the method's kind; None where there is none, or its spheres block
     is_solid: bool  # whether it blocks its own light as its convex parts do
     parts: GroupConvexParts | None  # these, two or more: one alone never shades itself; else None
-    extents: BodyExtents | None  # of all bodies; None without planes
+    body_sides: BodySides | None  # of all bodies; None without planes
 
     @property
     def number(self) -> int:
@@ -130,24 +130,24 @@ class Group:
     def fronts_of_planes(self) -> PlaneFronts:
         """As :meth:`find_fronts`, of the planes around the group."""
         assert self.planes is not None
-        return self.find_fronts(self.planes.frames, self.planes.planes, self.planes.skip)
+        return self.find_fronts(self.planes.frames, self.planes.blockers, self.planes.skip)
 
     def find_fronts(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> PlaneFronts:
         """Which part of each plane's front the receivers see, and the receivers lifted off planes they lie in."""
-        extents = None if self.own is None else self.own.extents
-        sides = None if extents is None else extents.sides_of(frames, planes)
+        body_sides = None if self.own is None else self.own.body_sides
+        sides = None if body_sides is None else body_sides.sides_of(frames, planes)
         body = 0 if self.own is None else self.own.number
         arguments = self.points, self.normals, sides, self.nearest_blockers, frames, planes
         return find_fronts(*arguments, body=body, skip=skip)
 
     def portions(self) -> Iterator[Group]:
-        """Portions of the receivers, with as many instances in all arrays where there are spheres.
+        """Portions of the receivers, with as many instances in all arrays where anything blocks.
 
         For a gradient all of them come at once, and so do receivers with cached rows.
         """
         own, planes, clusters = self.own, self.planes, self.clusters
         rotation_data = None if own is None or own.lookup is None else own.lookup.turned
-        positions = None if own is None or own.extents is None else own.extents.positions
+        positions = None if own is None or own.body_sides is None else own.body_sides.positions
         frames = None if planes is None else planes.frames
         parts = self.convex_parts_around or (None if own is None else own.parts)
         part_corners = None if parts is None else parts.placed_parts.corners
@@ -218,7 +218,7 @@ class Blockers(NamedTuple):
     spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres, blocking or not
     frames: wp.array | None  # where bodies are that block as planes, vec3 [batch, 3 · plane]; None without any
     placed_parts: PlacedParts | None  # where convex parts are; None without any
-    extents: BodyExtents | None  # how far out bodies reach; None where there are no planes
+    body_sides: BodySides | None  # on which side of planes bodies lie; None where there are no planes
 
     def sphere_blockers(self, bodies: Iterable[int]) -> list[int]:
         """Bodies among some that block light by their spheres."""
@@ -340,7 +340,7 @@ def _groups_that_move(
                 self_lookups.get(span.body),
                 span.body in blockers.blocker_kinds.solids,
                 blockers.own_parts(span.body),
-                blockers.extents,
+                blockers.body_sides,
             )
             group = replace(group, own=own)
         if nearest_blockers is not None:

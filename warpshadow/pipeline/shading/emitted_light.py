@@ -230,11 +230,11 @@ def _log_of_planes(
     planes, numbers = group.planes, blockers.blocker_kinds.planes
     if planes is None or not group.is_blocked_by_planes:
         return None
-    assert blockers.extents is not None
-    points, sides = group.fronts_of_planes.lifted_points, blockers.extents.sides_of(planes.frames, planes.planes)
+    assert blockers.body_sides is not None
+    points, sides = group.fronts_of_planes.lifted_points, blockers.body_sides.sides_of(planes.frames, planes.blockers)
     skipped = -1 if planes.skip is None else planes.skip, numbers.index(body) if body in numbers else -1
     return find_log_transmittance_of_planes(
-        points, group.normals, placed_samples, span, planes.frames, planes.planes, sides, body, skipped
+        points, group.normals, placed_samples, span, planes.frames, planes.blockers, sides, body, skipped
     )
 
 

@@ -14,7 +14,7 @@ from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.scene_planes import ScenePlanes
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.node import Input
-from warpshadow.pipeline.receivers.groups import Blockers, BodyExtents
+from warpshadow.pipeline.receivers.groups import Blockers, BodySides
 from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
 
 
@@ -89,10 +89,10 @@ class SceneBlockers:
         owners = self.planes, self.parts, self.self_visibility, self._merged_scene.scene.visibility.merging
         frames = self.planes.frames(kinds.planes, positions) if kinds.planes else None
         placed_parts = self.parts.place_parts(kinds.convex, positions) if kinds.convex else None
-        extents = None
+        body_sides = None
         if kinds.planes or (self.planes.numbers and self._merged_scene.scene.bounces):
-            extents = BodyExtents(self.planes, positions)
-        return Blockers(self._merged_scene, kinds, *owners, positions, spheres, frames, placed_parts, extents)
+            body_sides = BodySides(self.planes, positions)
+        return Blockers(self._merged_scene, kinds, *owners, positions, spheres, frames, placed_parts, body_sides)
 
     def has_any(self, kinds: BlockerKinds, bodies: Iterable[int] | None = None) -> bool:
         """Whether some bodies, by default all, block light by spheres or convex parts."""

@@ -14,7 +14,7 @@ from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.image.slopes import find_mean_slopes
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
-from warpshadow.stages.receivers.footprints import find_footprints
+from warpshadow.stages.receivers.receiver_footprints import find_receiver_footprints
 from warpshadow.stages.receivers.sample_receivers import MAX_SHARED_SAMPLES
 from warpshadow.stages.silhouettes.find import Silhouettes
 
@@ -110,7 +110,7 @@ class ReceiverFinder:
         if receivers.sample_fragments is None or method.every_sample_receives:
             return receivers
         size = fragments.face_ids.shape[1] // self._supersampling, fragments.face_ids.shape[2] // self._supersampling
-        footprints = find_footprints(
+        footprints = find_receiver_footprints(
             receivers.sample_fragments,
             merged_scene.faces,
             self._footprint_widths,

@@ -76,7 +76,7 @@ class View(LitPoints):
         self._camera, self._supersampling, self._pose_count = camera, method.merged_scene.scene.supersampling, counts[0]
         self._size = self._supersampling * camera.width, self._supersampling * camera.height
         self._sample_count = counts[1] * self._size[0] * self._size[1]
-        self._samples = f"{self._sample_count:,} samples"
+        self._sample_text = f"{self._sample_count:,} samples"
         normals, receivers = self._wire(method, *self.dependencies)
         lit = method.merged_scene, materials, vertices, spheres, receivers, call
         super().__init__(*lit, static_bodies, normals, blocker_kinds, is_scene_view)
@@ -91,7 +91,7 @@ class View(LitPoints):
         blocker_kinds: BlockerKinds,
     ) -> tuple[Node, Node]:
         """From the vertices to their normals and to the receivers."""
-        merged_scene, samples = method.merged_scene, self._samples
+        merged_scene, samples = method.merged_scene, self._sample_text
         corners = functools.partial(View._vertices, self.weak)
         faces, two_sided = merged_scene.faces, merged_scene.two_sided_faces
         if static_bodies is None or cameras.requires_grad:
@@ -137,7 +137,7 @@ class View(LitPoints):
 
     def image(self, light: LightInput, materials: Materials) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
-        item_text, clip, fragments = self._samples, self.clip_positions, self.fragments_node
+        item_text, clip, fragments = self._sample_text, self.clip_positions, self.fragments_node
         shading, reflectance = self.shading(light, materials), self.reflectance(materials)
         shines = materials.roughness or materials.emission
         if not shines and reflectance.pyramids.requires_grad and not (shading.requires_grad or clip.requires_grad):
@@ -159,13 +159,13 @@ class View(LitPoints):
     def _find_reflectance(self, materials: Materials) -> SampleReflectance:
         textures = materials.textures_of["textures"]
         if not textures.images:
-            return materials.untextured_reflectance(self.fragments_node, self._samples)
+            return materials.untextured_reflectance(self.fragments_node, self._sample_text)
         pyramids = textures.pyramids
         if materials.textures is not self.materials.textures:
             pyramids = textures.pyramids_to(functools.partial(self.coarsest_level, textures.sizes))
-        arguments = self.fragments_node, self.clip_positions, pyramids, self._samples
+        arguments = self.fragments_node, self.clip_positions, pyramids, self._sample_text
         footprints = self.cached("footprints", textures.sizes, functools.partial(textures.footprints, *arguments))
-        return materials.reflectance(self.fragments_node, pyramids, footprints, self._samples)
+        return materials.reflectance(self.fragments_node, pyramids, footprints, self._sample_text)
 
     def coarsest_level(self, sizes: tuple) -> int | None:
         """Coarsest level that cached footprints in textures of some sizes take; on a GPU it waits for that, once."""
@@ -258,7 +258,7 @@ class View(LitPoints):
             return find_ratio_image(fragments.face_ids, catches, *arguments)
 
         inputs = detached(self.fragments_node), reflectance.samples, unshadowed
-        ratio = Node("ratio", divide, *inputs, items=self._samples, caches=False)
+        ratio = Node("ratio", divide, *inputs, items=self._sample_text, caches=False)
         body_light, inverse_light, base_factor = (
             field_of(ratio, name, caches=False) for name in ("body_light", "inverse_light", "base_factor")
         )
@@ -289,20 +289,20 @@ class View(LitPoints):
 
     def _radiance(self, shading: Node, reflectance: Node) -> Node:
         """Node of the samples."""
-        samples_of = functools.partial(Node, "radiance", items=self._samples, caches=False)
+        make_node = functools.partial(Node, "radiance", items=self._sample_text, caches=False)
         if self._is_moving:
             moving = self.silhouettes, self.clip_positions
-            return samples_of(_moving_radiance, self.receivers_node, shading, reflectance, *moving)
-        return samples_of(_radiance, self.receivers_node, shading, reflectance)
+            return make_node(_moving_radiance, self.receivers_node, shading, reflectance, *moving)
+        return make_node(_radiance, self.receivers_node, shading, reflectance)
 
     def _averaged(self, samples: Node, *, is_moving: bool = False) -> Node:
         """Node of the pixels, from samples, or from samples and edge colors of moving surfaces."""
-        samples_of = functools.partial(Node, items=self._samples, caches=False)
+        make_node = functools.partial(Node, items=self._sample_text, caches=False)
         smooth = _smooth_moving if is_moving else smooth_silhouettes
-        smoothed = samples_of("smoothing", smooth, samples, self.silhouettes, self.clip_positions)
+        smoothed = make_node("smoothing", smooth, samples, self.silhouettes, self.clip_positions)
         if self._supersampling == 1:
             return Node("averaging", identity, smoothed, idle="a pixel has one sample", caches=False)
-        return samples_of("averaging", average, smoothed, self._supersampling)
+        return make_node("averaging", average, smoothed, self._supersampling)
 
     def _white_radiance_of(self, shading: Node) -> Node:
         """Node of the samples if every surface were white; cached with the last shading."""

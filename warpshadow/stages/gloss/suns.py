@@ -275,7 +275,7 @@ def add_suns(lobe_light: LobeLight, lobes: Lobes, suns: Suns, transmittance: wp.
     count, receiver_count = common_batch(arrays), lobe_light.straight.shape[1]
     sums = LobeLight(*(empty((count, receiver_count), dtype=wp.vec3, device=device) for _ in range(2)))
     of_lobes = [lobes.normals, lobes.tangents, lobes.views, lobes.widths]
-    sun_transmittance = [
+    of_suns = [
         constant(suns.directions, wp.vec3, device),
         constant(suns.irradiance, wp.vec3, device),
         constant(suns.solid_angles, wp.float32, device),
@@ -283,7 +283,7 @@ def add_suns(lobe_light: LobeLight, lobes: Lobes, suns: Suns, transmittance: wp.
     launch(
         _reflect_suns,
         count * receiver_count,
-        inputs=[*of_lobes, *sun_transmittance, transmittance, *lobe_light],
+        inputs=[*of_lobes, *of_suns, transmittance, *lobe_light],
         outputs=[*sums],
         shared=[array for array in (*of_lobes, transmittance, *lobe_light) if len(array) < count],
         cost=_COST * len(suns.directions),

@@ -6,7 +6,7 @@
 d_k is the direction from the center c to patch k, A = 4π R² / K the area of each of the K patches, ω_k = b_k / |b_k|.
 E is over π. The root is π |b|² but for receivers closer to the shell than patches are to each other, as in
 :mod:`warpshadow.stages.emitters.light`. T is interpolated between cells of directions as for lobes
-(:mod:`warpshadow.stages.gloss.transmittance`):
+(:mod:`warpshadow.stages.gloss.transmittance`), by a narrower kernel:
 
     T(ω) = Σ_q k_q min(T_q, H_q) / Σ_q k_q H_q,   k_q = max(ω·ω_q − cos hρ, 0)² + ε,   H_q = s(n·ω_q / ρ)
 
@@ -27,7 +27,7 @@ from warpshadow.maths.directions import cell_radius, check_count
 from warpshadow.stages.cell_neighbors import cell_neighbors, texel_of
 from warpshadow.stages.shell.beams import center_of
 
-KERNEL_RADIUS = 1.6
+SHELL_KERNEL_RADIUS = 1.6
 """Distance of a cell from which it no longer counts, in cell radii: 3 to 6 cells count. The least that reaches one cell
 in each direction is 1.1."""
 
@@ -239,8 +239,9 @@ def shell_transfer(
     if transmittance is not None:
         check.shape("transmittance", transmittance.shape, ("batch", points.shape[1], len(cells)))
         transmittance = expand_rows(transmittance, count)
-        lookup.cells, lookup.neighbors = constant(cells, wp.vec3, device), cell_neighbors(cells, device, KERNEL_RADIUS)
-        lookup.reach_cosine = float(np.cos(KERNEL_RADIUS * cell_radius(len(cells))))
+        lookup.cells = constant(cells, wp.vec3, device)
+        lookup.neighbors = cell_neighbors(cells, device, SHELL_KERNEL_RADIUS)
+        lookup.reach_cosine = float(np.cos(SHELL_KERNEL_RADIUS * cell_radius(len(cells))))
         lookup.per_radius = 1 / float(cell_radius(len(cells)))
     variables = [points, normals, transmittance, shell]
     inputs = [*variables, constant(patches, wp.vec3, device), lookup]

@@ -4,14 +4,14 @@ exp*(f) = e^{f0/√4π} exp*(f̂ / 2^p)^{2^p}            [Lyu et al. 2021, secti
 
 Squarings are *held* where they would explode (:mod:`.held_squares`).
 
-The number of squarings is *blended*. p, the least with |f̂| / 2^p ≤ T, jumps as |f̂| grows. The value would jump with
-it, by some tenths of a percent, and finite differences of images would be wrong there. So from t = |f̂| / 2^p T = ½ on,
-where p squarings are just enough, the base approximation q of f / 2^p is blended with the square of q of f / 2^{p+1},
+The number of squarings is *blended*. p, the least with t = |f̂| / (2^p T) ≤ 1, jumps as |f̂| grows. The value would
+jump with it, by some tenths of a percent, and finite differences of images would be wrong there. For p > 0, t is in
+(½, 1]. From t = ½ on the base approximation q of f / 2^p is blended with the square of q of f / 2^{p+1},
 
-    (1 − w) q(f / 2^p) + w q(f / 2^{p+1})²,    w = smoothstep((t − ½) / (BLEND_START − ½))
+    (1 − w) q(f / 2^p) + w q(f / 2^{p+1})²,    w = smoothstep((t − ½) / (BLEND_END − ½))
 
-At t = 1, w = 1: there p + 1 squarings take over with the same value, and v has a continuous derivative. It costs one
-product more.
+and from t = BLEND_END on, w = 1. At t = 1, p + 1 squarings take over, at their t = ½ and w = 0, with the same value,
+and v has a continuous derivative. It costs one product more.
 """
 
 import functools
@@ -47,7 +47,7 @@ of `optimal_linear` is largest, as its table of single caps fits a sum of many s
 MIN_THRESHOLD = 0.01  # squarings amplify float32 rounding 2^p times; below this they cost more digits than they give
 MAX_SQUARINGS = 20  # limit of the squarings; a log that asks for more is cut down to it
 
-BLEND_START = 0.7
+BLEND_END = 0.7
 """|f̂| / 2^p, in thresholds, from which on the base approximation is wholly the square of that of half the log."""
 
 _SQUARING_COST = 0.5  # nanoseconds that exponentiation takes for a receiver and a pair of coefficients
@@ -86,7 +86,7 @@ def _make_find_squarings(order: int, lanes: int) -> wp.Function:
     """
     Lane = lane_type(lanes)
     sqrt = make_lane_functions(lanes).sqrt
-    PER_BLEND = wp.constant(1 / (BLEND_START - 0.5))
+    PER_BLEND = wp.constant(1 / (BLEND_END - 0.5))
 
     @wp.func
     def find_squarings(log: wp.array(dtype=Lane), threshold: float):

@@ -16,7 +16,7 @@ from warpshadow.stages.raster.screen import volume_rates
 
 
 @wp.kernel(enable_backward=False)
-def _find_footprints(
+def _find_receiver_footprints(
     # in
     sides: wp.array2d(dtype=wp.int32),
     barycentrics: wp.array2d(dtype=wp.vec3),
@@ -52,7 +52,7 @@ def _find_footprints(
         footprints[batch, first + receiver] = widths[face] * widths[face] * area
 
 
-def find_footprints(
+def find_receiver_footprints(
     fragments: Fragments,
     faces: wp.array,
     widths: np.ndarray,
@@ -79,7 +79,7 @@ def find_footprints(
     footprints = zeros(shape, dtype=wp.vec3, device=device)
     inputs = [fragments.face_ids, fragments.barycentrics, faces, constant(widths, wp.float32, device)]
     inputs += [positions, clip_positions, wp.vec2(2.0 / size[1], 2.0 / size[0]), shape[1] - count]
-    launch(_find_footprints, (shape[0], count), inputs=inputs, outputs=[footprints])
+    launch(_find_receiver_footprints, (shape[0], count), inputs=inputs, outputs=[footprints])
     return footprints
 
 
