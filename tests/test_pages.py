@@ -22,6 +22,7 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.views import scene_views
 from warpshadow.scene import blockers
 from warpshadow.scene.visibility import DIRECTIONS
+from warpshadow.stages.gloss.suns import _MAX_SUNS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -337,7 +338,16 @@ def test_figures_of_the_first_page_are_those_that_were_measured():
     ]
     (low, high), (low_bounces, high_bounces) = ((min(each), max(each)) for each in factors)
     assert f"{low:.0f} to {high:.0f} times as long, with bounces {low_bounces:.0f} to {high_bounces:.0f}" in stated
-    assert f"within {row_of('Gradients', 'by pose, 2 × 2 samples per pixel (default): `directional`')[-1]}%" in stated
+    _, small, _, large = row_of("Gradients", "by pose, 2 × 2 samples per pixel (default): `directional`")
+    assert table_rows("Gradients")[0][1:] == ["32²", "64²", "128²", "256²"]
+    assert f"within {large}% of differences under a sun in images of 256², {small}% in 64²" in stated
+
+
+def test_pages_say_how_many_suns_are_reflected_one_by_one():
+    number = ("four", "five", "six", "seven", "eight")[_MAX_SUNS - 4]
+    texts = [page.read_text("utf-8") for page in PAGES if page.name != "CHANGELOG.md"]
+    stated = [word for text in texts for word in re.findall(r"[uU]p to (\w+) (?:suns|of 6°)", text)]
+    assert len(stated) == 4 and set(stated) == {number}
 
 
 # ------------------------------------------------------------------------------------------------ commands

@@ -13,7 +13,6 @@ from warpshadow.torch import TorchRenderer
 from warpshadow.tuning.timing import whole_image
 
 # Kernels and memory sets; they may fall. Parts are put together by NumPy on a CPU, on a GPU by a kernel for each.
-# A pose iteration is to have at most 40 kernels, with two bounces 90. One finds which samples have mean slopes.
 MOST = {
     "image": (40, 8),
     "pose iteration": (63, 5),

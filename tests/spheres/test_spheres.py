@@ -449,6 +449,8 @@ def test_a_ragged_shadow_costs_one_warning_for_a_mesh_with_the_remedy(monkeypatc
     with pytest.warns(UserWarning, match='.mesh. is thin for 64 spheres: .*21%.*blockers = "auto".*ray-traced') as told:
         fit_spheres(thin, **others)
     assert len(told) == 1
+    with pytest.warns(UserWarning, match="around it is off by 21%"):
+        fit_spheres(bumpy(), **others, seen_from=(0, 1, 0))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         fit_spheres(thin, **others)

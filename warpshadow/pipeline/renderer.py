@@ -64,8 +64,9 @@ class SceneRenderer:
     """Renders a scene, or instances of it with other geometry, cameras, light and reflectance.
 
     Results that depend on the scene's own geometry and cameras alone are cached: of direct light on diffuse bodies,
-    another image by other light or reflectance then costs a dot product for each receiver, and a gather. Methods that
-    return arrays are differentiable under Warp's tape, in the arguments that their docstrings name.
+    another image by other free light then costs a dot product for each receiver, and a gather; by other reflectance the
+    gather alone. Other known light finds visibility again. Methods that return arrays are differentiable under Warp's
+    tape, in the arguments that their docstrings name.
 
     Args:
         cameras: In place of the scene's camera any number of them, of one size and near plane, whose images are a
@@ -73,7 +74,7 @@ class SceneRenderer:
         basis: Basis of free light; None for the method's own: cells of directions ("directional") or spherical
             harmonics.
     Attributes:
-        scene: The scene; a method "auto" has been replaced by the chosen one, and so have receivers "auto".
+        scene: The scene; receivers "auto" have been replaced by the chosen ones.
         cameras: The cameras of the scene.
         has_camera_batch: Whether they were given as a batch.
         basis: Basis of free light.
@@ -455,7 +456,8 @@ class SceneRenderer:
             inputs: All that an image takes.
         Returns:
             The stages, which print as a table: whether each runs and on how many items, how long it took last, and why
-            it does or does not run; then the same of the adjoints. Nothing of the call is computed.
+            it does or does not run; then the same of the adjoints. Nothing of the call is computed, but the coarsest
+            level of textures that is seen.
         """
         return self.explain_inputs(inputs, inputs.view)
 

@@ -125,7 +125,7 @@ def fit_spheres(
     with unrecorded():
         balls, report = fit_count(count) if error is None else _search(fit_count, error)
     if error is None and refine and warns:
-        _warn_of_holes(mesh, count, report)
+        _warn_of_holes(mesh, count, report, seen_from)
     balls = balls[compact_order(balls[:, :3])]  # neighbors are culled together
     spheres = Spheres(balls[:, :3] * diagonal + center, balls[:, 3] * diagonal)
     if cache:
@@ -133,10 +133,11 @@ def fit_spheres(
     return SphereFit(spheres, report)
 
 
-def _warn_of_holes(mesh: Mesh, count: int | str, report: FitReport) -> None:
+def _warn_of_holes(mesh: Mesh, count: int | str, report: FitReport, seen_from: tuple | None) -> None:
     """Warn once of a mesh too thin for spheres that are many; whoever asks for few knows; flats need none."""
+    where = "on a ground" if seen_from is None else "around it"
     wrongs = {
-        f"the shadow that they cast on a ground is off by {report.shadow_error:.0%}, so it is ragged": (
+        f"the shadow that they cast {where} is off by {report.shadow_error:.0%}, so it is ragged": (
             report.shadow_error > BAD_SHADOW and report.ground_error > MIN_GROUND_ERROR
         ),
         f"the light in its cavities and around it is off by {report.nearby_error:.0%}": report.nearby_error > BAD_AIR,

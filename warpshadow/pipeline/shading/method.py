@@ -55,8 +55,8 @@ class Method(abc.ABC):
     | :meth:`find_squares` | adaptive receivers | None, where every sample receives light |
     | the four fields below | as they say | False |
 
-    A scene is refused whose bodies shine, or whose light bounces, where the method's row of ``METHOD_TRAITS``
-    (:mod:`warpshadow.scene.visibility`) says no: the method then needs no member for that.
+    A scene is refused whose bodies shine or emit, or whose light is near or bounces, where the method's row of
+    ``METHOD_TRAITS`` (:mod:`warpshadow.scene.visibility`) says no: the method then needs no member for that.
 
     Args:
         merged_scene: The bodies.

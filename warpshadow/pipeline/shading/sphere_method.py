@@ -65,7 +65,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     | :meth:`free_basis_of_shell` | light from a shell that a call gives | refused |
     | :attr:`scene_blockers` | planes and convex parts | spheres, and self-visibility by rays |
     | :attr:`emitter_cells` | lamps, past the self-visibility of receivers | None: without it |
-    | :meth:`share_of_sharpest_light` | adaptive receivers | None: no shadow is sharp |
+    | :meth:`share_of_sharpest_light` | adaptive receivers | None, as where nothing blocks |
 
     :class:`PortionedVisibility` calls find_visibility, then find_visibility_past_planes; :class:`PortionedTransfer`
     goes on with transfer, and :class:`PortionedShading` with that and shade_transfer, or with shade_transmittance.
