@@ -63,7 +63,7 @@ class Input:
 
         On a CPU values are compared. On a GPU, which would have to wait for that, an array is the same if it has the
         same ``origin``, the tensor whose memory it is, and the same ``version``, which counts the writes to that.
-        While a graph is captured none is: replays read values that are written to it later.
+        While a graph is captured no array counts as the same: its replays read values that are written later.
         """
         result = cls(name, value)
         if result.requires_grad:

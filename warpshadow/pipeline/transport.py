@@ -1,7 +1,7 @@
 """Light transport: which nodes make the light on receivers, direct and bounced.
 
-Light on receivers is direct light, light that bounces, and direct light of emitters. By light, bounces, reflectance,
-and where bodies and cameras are:
+Light on receivers is a sum: direct light of the map, light that bounces, direct light of emitters. Which nodes make the
+first two, by light, bounces, reflectance, and where bodies and cameras are:
 
 | light | bounces | reflectance | bodies, cameras | spheres stand in for bodies | rays meet bodies |
 | --- | --- | --- | --- | --- | --- |

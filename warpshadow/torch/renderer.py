@@ -319,9 +319,9 @@ class TorchRenderer(torch.nn.Module):
             scales: Of each body, [body] or [batch, body]; by default the scene's.
             rest: The bodies in their own spaces, from :meth:`deformed`; by default as their meshes are.
             moving: Bodies that the poses move, by number or name; None for any. The others stand where the scene has
-                them, without a gradient, and where light neither bounces nor is near results about them are cached: so
-                by "directional" they cast their meshes' shadows on one another. Bodies that ``rest`` deforms count as
-                moving.
+                them, without a gradient, and where light neither bounces nor is near results about them are cached. By
+                "directional" these come from rays against their meshes, so that they shadow each other by meshes.
+                Bodies that ``rest`` deforms count as moving.
             pivot: Point of each body's own space that it is turned about and that ``translations`` put in its place:
                 "center", the middle of its mesh's bounds, or points, [body, 3] or [batch, body, 3]; None for the
                 origin, which is the one of the mesh's file. ``scene_poses(pivot=…)`` are the poses to begin with.

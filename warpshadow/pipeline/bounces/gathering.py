@@ -165,8 +165,8 @@ class Gathering:
         if planes.blockers.count == (skip is not None):
             return None
         fronts = group.find_fronts(outgoing.frames, planes.blockers, skip)
-        # Cells look to where the light of the sky is, above horizons; light of planes is found around their middles. A
-        # ball on a ground lost 4% of the ground's light by the former.
+        # Planes are seen through the middles of cells. Through transmittance.directions, where skylight comes from,
+        # which are above horizons, a ball on a ground lost 4% of the ground's light.
         middles = fibonacci(len(transmittance.directions))
         arguments = fronts.lifted_points, group.normals, transmittance.transmittance_nonplanar, outgoing.frames
         options = {"coverages": transmittance.part_coverages, "front_weights": fronts.front_weights, "skip": skip}

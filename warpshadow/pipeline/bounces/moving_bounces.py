@@ -6,11 +6,12 @@ Patches have a radiosity B, reflected from direct light S and bounced light I:
 
 G is applied as often as light bounces: first at the patch samples, points where patches are lit, at last at the
 receivers of the image. It has three parts, each a stage of its own: light from a body's own patches, from plane bodies,
-and from the proxies of other bodies. A blocked part of a cell sends light of one of the three.
+and from the proxies of other bodies. The blocked part of a cell sends light of one of the three alone, so that none
+counts twice.
 
-Between patches of one body the first part is a small matrix that does not change. Light within each body bounces
-``SELF_BOUNCES`` times more, since hollow bodies keep it long: after the last bounce between bodies, and of all bounces
-after each.
+Between patches of one body the first part is a small matrix that does not change. Within a body light goes on for
+``SELF_BOUNCES`` more bounces, since hollow bodies hold it long: after the last bounce between bodies; with bounces
+"all" after each of them.
 """
 
 from __future__ import annotations

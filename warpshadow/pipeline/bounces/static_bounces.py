@@ -8,9 +8,9 @@ With direct shading S and albedo a an iteration finds the radiosity of patches a
 and receivers gather F B. Light that a body sends to itself may go on for longer than that. Receivers of an image are
 many: F is found at some of them, and interpolated.
 
-Direct light, past spheres, leaves the share s of an even sky open; rays hit bodies in the share f of the hemisphere. So
-that sky and bodies fill it once, F of a point is scaled by (1 − s) / f. Otherwise light is gained and lost: eighteen
-white balls in a white furnace were 0.91 to 1.06 bright.
+Two methods say how open a point is: spheres, past which its direct light comes, leave the share s of the hemisphere
+open; rays, which find F, hit bodies in the share f. As s + f need not be 1, F of a point is scaled by (1 − s) / f.
+Otherwise light is gained and lost: eighteen white balls in a white furnace were 0.91 to 1.06 bright.
 
 Points inside another body see its inside; they count neither in means over patch samples nor as cache points. Where all
 patch samples of a patch are inside, a part of the patch between them may be seen: it has the light of the nearest patch

@@ -66,9 +66,10 @@ have 2 to 4%.
 """
 
 UNEVEN_SHARE = 0.25
-"""Part of the largest faces above (:data:`LARGE_FACE`, :data:`LARGE_SHARE`) beyond which less is uneven, as teeth of a
-shadow's edge are as long as faces: in inverse proportion to their sides, down to half as much. A bowl with an egg in
-it, 192² pixels (7.2 pixels a face; 6%), is 4.9% off at vertices, 2.8% by pixel, in 2.1 times the time."""
+"""From this part of the largest area (:data:`LARGE_FACE`, :data:`LARGE_SHARE`) on, :data:`UNEVEN` is multiplied by
+√(UNEVEN_SHARE · largest / area), which is ½ at the largest: teeth of a shadow's edge are as long as the side of a face.
+A bowl with an egg in it, 192² pixels (7.2 pixels a face; 6%), is 4.9% off at vertices, 2.8% by pixel, in 2.1 times the
+time."""
 
 _LONG_SHARE = 0.05
 """Share of a body's pixels that its longest faces show: in 256² pixels such faces are longer than 8 to 12 pixels on

@@ -28,7 +28,7 @@ class LitLobes(NamedTuple):
     points: LitPoints
     light: LightInput  # known or free, which says where shadows have to be sharp
     all_points: LitPoints  # the receivers of the image, among which they are
-    select: Callable[[Node], Node]  # of a node of light on all_points makes one of light on points
+    select: Callable[[Node], Node]  # the light on points out of a node of light on all_points
 
 
 class LobeVisibility:

@@ -269,8 +269,8 @@ class PortionedVisibility(Node):
     """Visibility of receivers, found group by group and portion by portion; classes below add steps.
 
     Each step is a function of the method. The value is a list of the results of all portions. Without a gradient,
-    transfer vectors of all receivers are in memory at once only where they are the result: for free light, and in the
-    visibility that bounces cache while colors vary. Receivers with cached rows are one portion.
+    one portion's transfer vectors are in memory at a time; all of them only where they are the result: in free light,
+    or where bounces cache visibility since colors vary. Receivers with cached rows are one portion.
 
     Args:
         method: How light is blocked.

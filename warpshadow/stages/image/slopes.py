@@ -9,10 +9,11 @@ is far from the mean. So the mean over the sample is taken. To the right of the 
 
 and likewise to the other sides. An edge at t > ½ lies in the neighbor, which shows this surface up to it. With the step
 c_edge − c over t, steps along a row add up to the color at the surface's right edge minus that at its left; the
-derivative of the moving edges has the same with the other sign, and both cancel. For that a step to an edge moves with
-the edge's point, not the sample's; and a sample counts along a row with its extent there, ½ + t beside an edge, and so
-along a column, not with its weight in the smoothed image, which is that of one of both. (Else a ball of metal of
-roughness 0.2 before a sun has a gradient of −3500 where the slope of the image is 1300; so it has 1630.)
+derivative of the moving edges has the same with the other sign. They cancel only if the step to an edge follows the
+edge's point, and if a sample counts along a row as far as its surface reaches there: 1, or ½ + t beside an edge (along
+a column likewise). The smoothed image weighs it once for both axes; so slopes are multiplied by extent / weight. (Else
+a ball of metal of roughness 0.2 before a sun has a gradient of −3500 where the slope of the image is 1300; so it has
+1630.)
 
 Where another surface comes in front before the neighbor's center, or the image ends, the opposite half counts alone.
 Where all neighbors see the same face, the slope is the face's own.
