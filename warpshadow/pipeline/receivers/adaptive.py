@@ -18,7 +18,6 @@ from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.receivers.lit_points import VisibleSurfaces
 from warpshadow.stages.receivers.find import points_of_fragments
 from warpshadow.stages.receivers.quadtree import Quadtree, find_quadtree, probe_grid
-from warpshadow.stages.receivers.receiver_footprints import find_receiver_footprints
 from warpshadow.stages.receivers.sample_receivers import fragments_of_samples
 
 
@@ -35,9 +34,8 @@ def find_squares(
             sharpest shadows, shape [batch, receiver]; None where nothing blocks.
         surfaces: The samples, and the bodies; no gradient passes to them.
     """
-    positions, normals, fragments, spheres, is_adaptive, supersampling, clip_positions, footprint_widths = surfaces
+    positions, normals, fragments, spheres, is_adaptive, supersampling, footprints_of = surfaces
     positions, normals, centers, radii = map(without_gradient, (positions, normals, *spheres))
-    size = fragments.face_ids.shape[1] // supersampling, fragments.face_ids.shape[2] // supersampling
     with unrecorded():
         blockers = place_blockers(positions, (centers, radii))
     merged_scene = blockers.merged_scene
@@ -54,9 +52,8 @@ def find_squares(
                 continue
             seen = fragments_of_samples(fragments, probes[columns])
             points_and_normals = points_of_fragments(positions, normals, merged_scene.faces, seen)
-            shape = points_and_normals[0].shape
-            arguments = seen, merged_scene.faces, footprint_widths, positions, clip_positions, size, shape
-            group = blockers.around_plane(*points_and_normals, find_receiver_footprints(*arguments), body)
+            footprints = footprints_of(seen, points_and_normals[0].shape)
+            group = blockers.around_plane(*points_and_normals, footprints, body)
             portions = [share_of_sharpest_light(portion) for portion in group.portions()]
             known = [portion for portion in portions if portion is not None]
             if known:

@@ -50,8 +50,8 @@ class VisibleSurfaces(NamedTuple):
     spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres
     is_adaptive: np.ndarray  # bodies whose samples interpolate, which are flat, bool of shape [body]
     supersampling: int  # samples of a pixel across and down
-    clip_positions: wp.array  # of all vertices, vec4 of shape [batch, vertex]
-    footprint_widths: np.ndarray  # of receivers on each face [pixels], shape [face]
+    # footprints of receivers at samples, given the fragments that these see, and the shape of all receivers
+    footprints_of: Callable[[Fragments, tuple[int, int]], wp.array]
 
 
 ONLY_SPHERES = BlockerKinds()  # all bodies block by their spheres

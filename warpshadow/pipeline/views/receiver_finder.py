@@ -7,7 +7,6 @@ import warp as wp
 
 from warpshadow.device.constants import gather_of_owners
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.device.launch import without_gradient
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, VisibleSurfaces
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.method import Method
@@ -67,6 +66,8 @@ class ReceiverFinder:
         Differentiable: positions, normals, barycentrics of the fragments.
         """
         method, merged_scene, quadtree, has_mean_slope = self._method, self._merged_scene, None, None
+        size = fragments.face_ids.shape[1] // self._supersampling, fragments.face_ids.shape[2] // self._supersampling
+        footprints_of = functools.partial(self._find_footprints, positions, clip_positions, size)
         has_backs, at_samples = fragments.sides is not None, method.samples_receive(self._blocker_kinds)
         if not is_readable(merged_scene.device):
             numbering = method.numbering(self._blocker_kinds, has_backs, self._static_bodies)
@@ -82,8 +83,7 @@ class ReceiverFinder:
                     spheres,
                     is_adaptive,
                     self._supersampling,
-                    without_gradient(clip_positions),
-                    self._footprint_widths,
+                    footprints_of,
                 )
                 quadtree = method.find_squares(self._blocker_kinds, surfaces)
         if at_samples.any() and fragments.barycentrics.requires_grad:
@@ -109,17 +109,19 @@ class ReceiverFinder:
         )
         if receivers.sample_fragments is None or method.every_sample_receives:
             return receivers
-        size = fragments.face_ids.shape[1] // self._supersampling, fragments.face_ids.shape[2] // self._supersampling
-        footprints = find_receiver_footprints(
-            receivers.sample_fragments,
-            merged_scene.faces,
-            self._footprint_widths,
-            positions,
-            clip_positions,
-            size,
-            receivers.points.shape,
-        )
-        return receivers._replace(footprints=footprints)
+        return receivers._replace(footprints=footprints_of(receivers.sample_fragments, receivers.points.shape))
+
+    def _find_footprints(
+        self,
+        positions: wp.array,
+        clip_positions: wp.array,
+        size: tuple[int, int],
+        seen: Fragments,
+        shape: tuple[int, int],
+    ) -> wp.array:
+        """Find the footprints of receivers at samples, given the fragments that these see."""
+        arguments = positions, clip_positions, size, shape
+        return find_receiver_footprints(seen, self._merged_scene.faces, self._footprint_widths, *arguments)
 
     @functools.cached_property
     def _footprint_widths(self) -> np.ndarray:
