@@ -10,7 +10,7 @@ import warp as wp
 from warpshadow.device.batch import instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty, zeros
+from warpshadow.device.memory import empty
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.screen import volume_rates
 
@@ -29,18 +29,23 @@ def _find_receiver_footprints(
     # out
     footprints: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a sample receiver; the footprints are zero before."""
+    """A thread owns a receiver, of which those at samples are the last."""
     batch, receiver = wp.tid()
     fragment_batch = instance_in(batch, sides.shape[0])
-    face = sides[fragment_batch, receiver] % faces.shape[0]
-    if sides[fragment_batch, receiver] >= 0 and widths[face] > 0.0:
+    sample = receiver - first
+    side = int(-1)
+    if sample >= 0:
+        side = sides[fragment_batch, sample]
+    face = wp.max(side, 0) % faces.shape[0]
+    footprint = wp.vec3()
+    if side >= 0 and widths[face] > 0.0:
         corners = faces[face]
         clip = clip_positions[instance_in(batch, clip_positions.shape[0])]
         corner_positions = positions[instance_in(batch, positions.shape[0])]
         a = clip[corners[0]]
         b = clip[corners[1]]
         c = clip[corners[2]]
-        weights = barycentrics[fragment_batch, receiver]
+        weights = barycentrics[fragment_batch, sample]
         point = weights[0] * a + weights[1] * b + weights[2] * c
         rates_x, rates_y = volume_rates(a, b, c, wp.vec2(point[0] / point[3], point[1] / point[3]), pixel)
         origin = corner_positions[corners[0]]
@@ -49,7 +54,8 @@ def _find_receiver_footprints(
         by_x = rates_x - (rates_x[0] + rates_x[1] + rates_x[2]) * weights
         by_y = rates_y - (rates_y[0] + rates_y[1] + rates_y[2]) * weights
         area = wp.cross(by_x[1] * along_b + by_x[2] * along_c, by_y[1] * along_b + by_y[2] * along_c)
-        footprints[batch, first + receiver] = widths[face] * widths[face] * area
+        footprint = widths[face] * widths[face] * area
+    footprints[batch, receiver] = footprint
 
 
 def find_receiver_footprints(
@@ -76,10 +82,10 @@ def find_receiver_footprints(
     Not differentiable.
     """
     device, count = faces.device, fragments.face_ids.shape[1]
-    footprints = zeros(shape, dtype=wp.vec3, device=device)
+    footprints = empty(shape, dtype=wp.vec3, device=device)
     inputs = [fragments.face_ids, fragments.barycentrics, faces, constant(widths, wp.float32, device)]
     inputs += [positions, clip_positions, wp.vec2(2.0 / size[1], 2.0 / size[0]), shape[1] - count]
-    launch(_find_receiver_footprints, (shape[0], count), inputs=inputs, outputs=[footprints])
+    launch(_find_receiver_footprints, shape, inputs=inputs, outputs=[footprints])
     return footprints
 
 
