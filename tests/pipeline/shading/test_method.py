@@ -5,10 +5,11 @@ import re
 
 import pytest
 
+from warpshadow.pipeline.methods.cell_lobes import CellLobes
 from warpshadow.pipeline.methods.directional import Directional
 from warpshadow.pipeline.methods.log_sh import LogSH
 from warpshadow.pipeline.methods.none import NoShadows
-from warpshadow.pipeline.methods.ray_traced import RayTraced
+from warpshadow.pipeline.methods.ray_traced import RayTraced, TracedLobes
 from warpshadow.pipeline.shading.lobe_light import LobeVisibility
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.shading.sphere_method import SphereMethod
@@ -24,7 +25,7 @@ def refuses(function):
     return "raise NotImplementedError" in inspect.getsource(function)
 
 
-@pytest.mark.parametrize(("kind", "row_count"), [(Method, 9), (SphereMethod, 13), (LobeVisibility, 3)])
+@pytest.mark.parametrize(("kind", "row_count"), [(Method, 9), (SphereMethod, 13), (LobeVisibility, 4)])
 def test_the_table_of_members_says_which_have_a_default(kind, row_count):
     rows = table(kind)
     defaults = {name: default for names, default in rows for name in names}
@@ -35,10 +36,11 @@ def test_the_table_of_members_says_which_have_a_default(kind, row_count):
     assert {name for name, default in defaults.items() if default == "refused"} == refused
 
 
-@pytest.mark.parametrize("kind", [Directional, LogSH, NoShadows, RayTraced])
+@pytest.mark.parametrize("kind", [Directional, LogSH, NoShadows, RayTraced, CellLobes, TracedLobes])
 def test_each_member_that_a_method_overrides_is_in_a_table(kind):
-    listed = {name for base in (Method, SphereMethod) for names, _ in table(base) for name in names}
-    members = {name for name, member in (vars(Method) | vars(SphereMethod)).items() if not isinstance(member, bool)}
+    bases = (LobeVisibility,) if issubclass(kind, LobeVisibility) else (Method, SphereMethod)
+    listed = {name for base in bases for names, _ in table(base) for name in names}
+    members = {name for base in bases for name, member in vars(base).items() if not isinstance(member, bool)}
     overridden = {name for name in vars(kind) if name in members and not name.startswith("_")} - {"why_no_shadows"}
     assert overridden and overridden <= listed
 

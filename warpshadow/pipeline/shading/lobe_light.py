@@ -42,6 +42,7 @@ class LobeVisibility:
     | :meth:`transmittance` | shadows in mirrored light | 1: no shadows |
     | :meth:`sun_transmittance` | suns | :meth:`transmittance` in :attr:`sun_sample_count` directions of each |
     | :meth:`blocked_radiance` | light that bounces | refused |
+    | :attr:`sample_count`, :attr:`sun_sample_count` | the noise of its shadows | 32; 1 |
 
     Args:
         merged_scene: The bodies.
