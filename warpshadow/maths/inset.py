@@ -37,7 +37,8 @@ def inset_vertices(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
         np.add.at(offsets, corner, middles - points[corner])
         is_flat[corner[np.abs((first_normals[corner] * normals).sum(axis=1)) < 1 - _FLATNESS]] = False
     offsets /= np.maximum(counts, 1)[:, None]
-    offsets -= (offsets * first_normals).sum(axis=1, keepdims=True) * first_normals  # where it is all but flat
+    # into the tangent plane, so that points stay in surfaces that are all but flat
+    offsets -= (offsets * first_normals).sum(axis=1, keepdims=True) * first_normals
     distances = np.linalg.norm(offsets, axis=1)
     smallest = _ROUNDING * np.abs(points[faces]).max(initial=0.0)
     shares = np.clip(smallest / np.maximum(distances, 1e-30), _SHARE, 0.5)

@@ -84,7 +84,7 @@ def _solid_behind(body: Body, others: tuple[Body, ...]) -> Land | None:
 
 
 def _share_behind_panels(mesh: Mesh, axis: np.ndarray, points: np.ndarray) -> float:
-    """Share of some points before a mesh that are behind its panels, which are chords of it, as an axis looks."""
+    """Share of some points before a mesh, seen along an axis, that are behind its panels, which are chords of it."""
     is_behind = np.zeros(len(points), bool)
     for panel in mesh.convex_parts:
         corners = mesh.positions[panel.corners].astype(np.float64)

@@ -4,9 +4,10 @@ Each sphere blocks a cone of directions of half-angle θ. Its transmittance rise
 falloff, and the opacity A makes up for that: the blocked solid angle is exactly the cone's.
 
     T_q(x) = Π_i (1 − A_i smoothstep((u_i·ω_q − lo_i) / (hi_i − lo_i)))
-    lo = cos(θ+w),  hi = cos(max(θ−w, 0)),  A = min(1, (1 − cos θ) / (1 − (hi+lo)/2)),  w = κ·ρ,  ρ = 2/√Q
+    lo = cos(θ+w),  hi = cos(max(θ−w, 0)),  A = min(1, (1 − cos θ) / (1 − (hi+lo)/2)),  ρ = 2/√Q
 
-A receiver that stands for an area f² sees the mean over it: an edge at distance d moves by an angle of f/d, so
+w = κρ for receivers that are points. One that stands for an area f² sees the mean over it: an edge at distance d moves
+by an angle of f/d, so then
 
     sin²w = sin²κρ + 5/12 f² / (d² + 5/6 f²),   d² = D² − r²
 

@@ -173,13 +173,13 @@ def prepare_traversal(
 @functools.cache
 def receiver_lanes_type(lanes: int) -> Any:
     """Struct of a block of receivers."""
-    Vectors = vectors_type(lanes)
+    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.struct
     class ReceiverLanes:
         points: Vectors
         normals: Vectors  # 0 where there is no horizon
-        footprints: wp.types.vector(length=lanes, dtype=wp.float32)  # 0 where they are points
+        footprints: Lane  # 0 where they are points
 
     return ReceiverLanes
 
