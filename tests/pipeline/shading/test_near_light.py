@@ -140,7 +140,10 @@ def test_the_shell_of_free_light_in_another_basis_has_its_gradient_with_bounces(
     assert float(shell.grad @ way) == pytest.approx((ends[0] - ends[1]) / (20 * STEP), rel=0.03)
 
 
-def test_a_batch_of_shells_is_one_after_another(renderer):
+@pytest.mark.parametrize("gloss", [{}, {"roughness": 0.4}], ids=["diffuse", "plastic"])
+@pytest.mark.parametrize("bounces", [0, 1])
+def test_a_batch_of_shells_is_one_after_another(gloss, bounces):
+    renderer = TorchRenderer(scene_of(bounces=bounces, size=24, **gloss))
     shells = torch.tensor([[*CENTER, 2.2], [0.1, 0.6, 0, 2.5]])
     together = renderer(shell=shells)
     torch.testing.assert_close(together, torch.stack([renderer(shell=shell) for shell in shells]), rtol=1e-5, atol=1e-6)

@@ -58,6 +58,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         is_near = merged_scene.scene.shell is not None
         native_basis = PATCHES if is_near else CellBasis(self._directions)
         super().__init__(merged_scene, native_basis, basis, progress=progress)
+        self.widens_edges = not is_near
         self.free_basis = ProjectedCells(
             self._directions, patches=None if self.shell is None else ShellPatches(self.shell)
         )

@@ -66,6 +66,8 @@ class Method(abc.ABC):
 
     every_sample_receives = False  # whether every sample is a receiver, overriding the bodies
 
+    widens_edges = False  # whether edges of a sun's shadow on flat bodies are as wide as receivers' footprints
+
     spheres_stand_in = False  # whether spheres stand in for bodies, by which light bounces where these move
 
     shares_directions = False

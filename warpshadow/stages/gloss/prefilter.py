@@ -315,15 +315,16 @@ def look_up_light(texels: wp.array, directions: wp.array, filters: wp.array) -> 
 
     Args:
         texels: Of :func:`prefilter`, linear RGB, vec3 of shape [batch, texel].
-        directions, filters: Of :func:`.lobes.sample_lobes`, [batch, receiver, sample].
+        directions, filters: Of :func:`.lobes.sample_lobes`, [batch, receiver, sample]. Either batch may be 1.
 
     Returns:
         Radiance, vec3 of shape [batch, receiver, sample].
 
     Differentiable: texels, directions, filters.
     """
-    check.shape("filters", filters.shape, directions.shape)
-    count, device = common_batch({"texels": texels, "directions": directions}), directions.device
+    check.shape("filters", filters.shape, ("batch", *directions.shape[1:]))
+    count = common_batch({"texels": texels, "directions": directions, "filters": filters})
+    device = directions.device
     directions, filters = expand_rows(directions, count), expand_rows(filters, count)
     inputs = [texels, constant(_level_offsets(texels.shape[1]), wp.vec2i, device), directions, filters]
     look_up, look_up_adjoint = _make_look_up(lane_count(device))
