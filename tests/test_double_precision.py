@@ -369,10 +369,10 @@ def test_gradients_of_coverage_by_convex_parts_are_exact(double, check, device):
     points = np.array([[[0.1, 2.2, 0.3], [-0.4, 0.7, -1.9], [2.5, 0.2, 1.5]]])
     given = (wp.vec3d, points), (wp.vec3d, positions)
     covered = cover(
-        put(points, wp.vec3d, device), blockers.placed(put(positions, wp.vec3d, device)), blockers, directions
+        put(points, wp.vec3d, device), blockers.place(put(positions, wp.vec3d, device)), blockers, directions
     ).numpy()[..., 0]
     assert ((covered > 0) & (covered < 1)).mean() > 0.2
-    check(lambda p, v: cover(p, blockers.placed(v), blockers, directions), *given)
+    check(lambda p, v: cover(p, blockers.place(v), blockers, directions), *given)
 
 
 def test_gradients_of_transmittance_past_parts_to_samples_are_exact(double, check, device):
@@ -397,7 +397,7 @@ def test_gradients_of_transmittance_past_parts_to_samples_are_exact(double, chec
 
     def transmittance(points, middles, areas, positions):
         samples = emitters.PlacedSamples(middles, areas, None, None, bundles, balls)
-        around = blockers.placed(positions), blockers, (-1, -1)
+        around = blockers.place(positions), blockers, (-1, -1)
         return past.find_log_transmittance_of_parts(points, normals, samples, span, *around)
 
     found = np.exp(transmittance(*(put(values, dtype, device) for dtype, values in given)).numpy())

@@ -341,7 +341,7 @@ def test_convex_parts_block_as_the_twin_does(device):
     arrays = [wp.array(item[None], dtype=wp.vec3, device=device) for item in (points, normals)]
     samples = samples_of(BALL, device)
     own = placed(samples, BALL.positions + np.float32([0.2, 1.3, 0.1]), device)
-    parts = blockers.placed(wp.array(vertices[None], dtype=wp.vec3, device=device))
+    parts = blockers.place(wp.array(vertices[None], dtype=wp.vec3, device=device))
     span = next(samples.spans())
     got = numbers(convex_transmittance.find_log_transmittance_of_parts(*arrays, own, span, parts, blockers, (-1, -1)))
     sample_points, areas = numbers(own.points), numbers(own.areas)
@@ -375,7 +375,7 @@ def log_past(mesh, points, normals, device):
     samples = samples_of(BALL, device)
     own = placed(samples, 0.5 * BALL.positions, device)
     arrays = [wp.array(item[None], dtype=wp.vec3, device=device) for item in (points, normals)]
-    parts = blockers.placed(wp.array(mesh.positions[None], dtype=wp.vec3, device=device))
+    parts = blockers.place(wp.array(mesh.positions[None], dtype=wp.vec3, device=device))
     got = convex_transmittance.find_log_transmittance_of_parts(
         *arrays, own, next(samples.spans()), parts, blockers, (-1, -1)
     )
@@ -497,7 +497,7 @@ def test_gradients_of_light_agree_with_differences(between, device):
             found = log_past_planes(*seen, arrays[4], blockers, (-1, -1))
             logs = {"log_of_planes": found}
         if between in ("parts", "panels"):
-            parts = box_blockers.placed(arrays[4])
+            parts = box_blockers.place(arrays[4])
             found = convex_transmittance.find_log_transmittance_of_parts(*seen, parts, box_blockers, (-1, -1))
             logs = {"log_of_parts": found}
         return light.sum_light(*arrays[:2], own, arrays[3], span, light.find_transmittance_to_samples(**logs))
