@@ -19,3 +19,11 @@ def test_exposure_is_that_of_the_covered_pixels():
     assert auto_exposure(image) == -2
     image[..., :3] = 0
     assert auto_exposure(image) == 0
+
+
+def test_a_lamp_in_view_does_not_turn_all_else_black():
+    image = np.full((20, 20, 3), 0.5)
+    image[:3, :3] = 50.0
+    assert auto_exposure(image) == 0
+    image[:3, :3] = 4.0
+    assert auto_exposure(image) == -2  # no lamp, but a highlight

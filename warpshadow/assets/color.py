@@ -4,17 +4,25 @@ import numpy as np
 
 GRAY = (0.8, 0.8, 0.8)  # reflectance of a surface of which nothing is said, linear
 
+_LAMP_RATIO = (
+    16.0  # brightness of the brightest 1% of pixels over that of the brightest tenth, from which they are lamps
+)
+
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, Rec. 709
 
 
 def auto_exposure(image: np.ndarray) -> float:
     """Exposure [stops] at which the brightest 1% of pixels, covered ones if there is coverage, saturate.
 
+    A lamp in view does not count: if these are 16 times as bright as the brightest tenth, twice the latter saturates.
+
     Args:
         image: Linear, shape [..., 4] with coverage, or [..., 3] or [..., 1] without.
     """
     covered_pixels = image[image[..., 3] > 0] if image.shape[-1] == 4 else image.reshape(-1, image.shape[-1])
-    bright_value = np.percentile(covered_pixels[:, :3].max(axis=1), 99) if len(covered_pixels) else 0.0
+    tenth, bright_value = np.percentile(covered_pixels[:, :3].max(axis=1), (90, 99)) if len(covered_pixels) else (0, 0)
+    if 0 < _LAMP_RATIO * tenth < bright_value:
+        bright_value = 2 * tenth
     return float(-np.log2(bright_value)) if 0 < bright_value < np.inf else 0.0
 
 

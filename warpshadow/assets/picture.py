@@ -29,7 +29,8 @@ class Picture:
     Args:
         image: Linear values: RGB and coverage, premultiplied, as :func:`warpshadow.render` returns them, shape
             [height, width, 4]; RGB [height, width, 3]; or gray [height, width] or [height, width, 1].
-        exposure: Factor of the image, in stops; by default the brightest 1% of covered pixels just saturate.
+        exposure: Factor of the image, in stops; by default the brightest 1% of covered pixels just saturate, and a
+            lamp in view beyond that.
         tone: Tone curve of bright color: "clip" cuts it off at 1, "filmic" bends it towards 1 (Narkowicz's fit of the
             ACES curve, 2016).
         background: Shown where the image covers nothing: None for transparent; a color of the picture, linear RGB [3]
