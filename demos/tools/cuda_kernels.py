@@ -45,9 +45,9 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
         for order, base in [(2, "quadratic"), *((8, base) for base in exponential.THRESHOLDS)]
     },
     **{
-        f"{make.__name__} {has_horizon}": partial(make, has_horizon, LANES)
+        f"{make.__name__} {has_horizon} {has_footprints}": partial(make, has_horizon, has_footprints, LANES)
         for make in (directional._make_transmit, directional._make_transmit_adjoint)
-        for has_horizon in (False, True)
+        for has_horizon, has_footprints in ((False, False), (True, False), (True, True))
     },
     **{
         f"{make.__name__} {order} {is_shadowed}": partial(make, order, is_shadowed, LANES)

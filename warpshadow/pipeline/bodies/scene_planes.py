@@ -61,19 +61,21 @@ class ScenePlanes:
     def half_spaces(self, number: int) -> np.ndarray:
         """Planes (n, d) of the other flat bodies, in a body's frame, n·x + d > 0 on the side from which they are seen.
 
-        That is where the bodies that are not flat and the camera are; a plane that has some on both sides is left out.
+        That is where the bodies that are not flat are, or all if every body is; a plane that has some on both sides is
+        left out.
         """
-        scene, result = self._merged_scene.scene, []
-        solids = [body.world_points().mean(axis=0) for n, body in enumerate(scene.bodies) if n not in self.numbers]
-        viewers, body = np.array([*solids, scene.camera.eye]), scene.bodies[number]
+        bodies, result = self._merged_scene.scene.bodies, []
+        middles = np.array([body.world_points().mean(axis=0) for body in bodies])
+        is_flat = self._merged_scene.is_flat
+        middles = middles if is_flat.all() else middles[~is_flat]
         for other in self.numbers:
-            points = scene.bodies[other].world_points()
+            points = bodies[other].world_points()
             normal = principal_axes(points)[2]
-            heights = (viewers - points[0]) @ normal
+            heights = (middles - points[0]) @ normal
             sides = np.unique(np.sign(heights[np.abs(heights) > _ROUNDING * np.ptp(points, axis=0).max()]))
             if other != number and len(sides) == 1:
-                normal = sides[0] * normal @ body.rotation_matrix()
-                result.append([*normal, -normal @ body.from_world(points[0])])
+                normal = sides[0] * normal @ bodies[number].rotation_matrix()
+                result.append([*normal, -normal @ bodies[number].from_world(points[0])])
         return np.array(result).reshape(-1, 4)
 
     def blockers(self, bodies: tuple[int, ...], blocking_bodies: tuple[int, ...]) -> PlaneBlockers:
