@@ -4,9 +4,7 @@ import numpy as np
 
 GRAY = (0.8, 0.8, 0.8)  # reflectance of a surface of which nothing is said, linear
 
-_LAMP_RATIO = (
-    16.0  # brightness of the brightest 1% of pixels over that of the brightest tenth, from which they are lamps
-)
+_LAMP_RATIO = 16.0  # brightness of the brightest 1% of pixels over the brightest tenth's, from which they are lamps
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear sRGB, Rec. 709
 

@@ -192,7 +192,7 @@ def free_shape_remark(scene: Scene, number: int) -> str:
             f"{called} is flat, and one sphere behind it blocks light in its place, whatever its shape becomes; "
             "blockers = fit_spheres(mesh, 64).spheres follow its vertices"
         )
-    if not any(map(is_panel, blocking_parts(scene).get(number, []))):
+    if not any(map(is_panel, _convex_parts(scene).get(number, []))):
         return ""
     return (
         f"{called} is a sheet or a thin wall: while its shape is free {SPHERES_BESIDE_PARTS} spheres block its light "

@@ -246,9 +246,8 @@ def find_plane_patches(
     labels = grid.texels_of((piece_mesh.centroids - origin) @ frame.T[:, :2])
     centers = origin + grid.middles().reshape(-1, 2) @ frame[:2]
     is_shown = grid.shown.ravel() == 1
-    if (
-        half_spaces is not None and not is_shown.all()
-    ):  # a piece that reaches out from behind a plane has light before it
+    if half_spaces is not None and not is_shown.all():
+        # a piece that reaches out from behind a plane has the light before it
         heights = piece_mesh.pieces.positions(positions, faces) @ half_spaces[:, :3].T + half_spaces[:, 3]
         reaches_out = (heights > _LIFT * np.ptp(heights, axis=(0, 1))).all(axis=2).any(axis=1) & ~is_shown[labels]
         shown_texels = np.flatnonzero(is_shown & (grid.covered.ravel() > 0))

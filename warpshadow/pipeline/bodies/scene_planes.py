@@ -64,19 +64,28 @@ class ScenePlanes:
         That is where the bodies that are not flat are, or all if every body is; a plane that has some on both sides is
         left out.
         """
-        bodies, result = self._merged_scene.scene.bodies, []
+        body, result = self._merged_scene.scene.bodies[number], []
+        for other, (point, normal) in self._seen_sides.items():
+            if other != number:
+                own_normal = normal @ body.rotation_matrix()
+                result.append([*own_normal, -own_normal @ body.from_world(point)])
+        return np.array(result).reshape(-1, 4)
+
+    @functools.cached_property
+    def _seen_sides(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """A point of each flat body that is seen from one side, and its normal on that side, in the world."""
+        bodies, result = self._merged_scene.scene.bodies, {}
         middles = np.array([body.world_points().mean(axis=0) for body in bodies])
         is_flat = self._merged_scene.is_flat
         middles = middles if is_flat.all() else middles[~is_flat]
-        for other in self.numbers:
-            points = bodies[other].world_points()
+        for number in self.numbers:
+            points = bodies[number].world_points()
             normal = principal_axes(points)[2]
             heights = (middles - points[0]) @ normal
             sides = np.unique(np.sign(heights[np.abs(heights) > _ROUNDING * np.ptp(points, axis=0).max()]))
-            if other != number and len(sides) == 1:
-                normal = sides[0] * normal @ bodies[number].rotation_matrix()
-                result.append([*normal, -normal @ bodies[number].from_world(points[0])])
-        return np.array(result).reshape(-1, 4)
+            if len(sides) == 1:
+                result[number] = points[0], sides[0] * normal
+        return result
 
     def blockers(self, bodies: tuple[int, ...], blocking_bodies: tuple[int, ...]) -> PlaneBlockers:
         """Plane blockers of some flat bodies, which send no light; ``blocking_bodies`` cast shadows."""

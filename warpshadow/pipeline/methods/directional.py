@@ -36,7 +36,6 @@ from warpshadow.stages.planes.coverage import plane_coverage
 from warpshadow.stages.planes.partial_cells import coverage_of_light
 from warpshadow.stages.raster.sides import split_sides
 from warpshadow.stages.rays.ray_tracing import trace_cells
-from warpshadow.stages.receivers.receiver_footprints import find_seen_areas
 from warpshadow.stages.self_visibility.gather import multiply_transmittances
 from warpshadow.stages.self_visibility.sun_cells import trace_sun_cells
 from warpshadow.stages.visibility import directional
@@ -168,8 +167,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if projected_light.sharp_cells is None:
             return transmittance
         directions, slots, scale = projected_light.sharp_cells
-        footprints = None if group.footprints is None else find_seen_areas(group.footprints, directions)
-        sharp = block(directions, footprints=footprints, **scales(scale))
+        sharp = block(directions, footprints=group.seen_footprints(directions), **scales(scale))
         return blend_sharp_cells(transmittance, sharp, slots, projected_light.spot_shares)
 
     def _scales(self, scale: float) -> dict[str, Any]:

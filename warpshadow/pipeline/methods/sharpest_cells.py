@@ -15,7 +15,6 @@ from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT
 from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.light.shading import shade_cells
 from warpshadow.stages.planes.coverage import plane_coverage
-from warpshadow.stages.receivers.receiver_footprints import find_seen_areas
 from warpshadow.stages.visibility import directional
 from warpshadow.stages.visibility.sharp_cells import SharpCells
 
@@ -74,7 +73,7 @@ def find_share_of_sharpest_light(
     if not radii.shape[1] and group.planes is None and group.convex_parts_around is None:
         return None
     if radii.shape[1]:
-        footprints = None if group.footprints is None else find_seen_areas(group.footprints, directions)
+        footprints = group.seen_footprints(directions)
         arguments = points, normals, centers, radii, directions
         transmittance = directional.transmittance(*arguments, softness=softness, merging=merging, footprints=footprints)
     else:

@@ -37,14 +37,11 @@ def find_bodies_with_buried_vertices(
     starts = merged_scene.first_vertex
     of_bodies = [positions[starts[number] : starts[number + 1]] for number in merged_scene.casting]
     bounds = [(vertices.min(axis=0) - margin, vertices.max(axis=0) + margin) for vertices in of_bodies]
+    is_plane = merged_scene.is_flat[merged_scene.casting]
+    planes = [vertices for vertices, is_flat in zip(of_bodies, is_plane, strict=True) if is_flat]
     mesh = normals = None
     for number, body in enumerate(bodies):
         corners = faces[visible_faces[merged_scene.body_of_face[visible_faces] == body]]
-        planes = [
-            vertices
-            for vertices, casting in zip(of_bodies, merged_scene.casting, strict=True)
-            if merged_scene.is_flat[casting]
-        ]
         if any(_cross(positions[corners], points, margin) for points in planes):
             result[number] = True
             continue

@@ -79,9 +79,7 @@ class CapFunctions(NamedTuple):
     """Kernel functions on caps."""
 
     widen_cone: wp.Function  # cones by w: axis, cosine and sine of θ, d², receivers, cells → caps
-    spread: (
-        wp.Function
-    )  # sin²w of receivers at distances d from the edges of shadows, past that of cells: d², receivers
+    spread: wp.Function  # by how much footprints add to sin²w at distances d from the edges of shadows: d², receivers
     reaches_bundle: wp.Function  # whether a cap reaches a bundle for any receiver
     is_above_horizon: wp.Function  # whether a cap rises above the horizon of any receiver
     soft_edge: wp.Function  # direction, cap, 1/(hi−lo) → t in the falloff, and its smoothstep
