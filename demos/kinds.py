@@ -193,10 +193,7 @@ def cage(sources: Sources, size: int) -> ws.Scene:
 
 
 def bowl(sources: Sources, size: int) -> ws.Scene:
-    bodies = [
-        body(shapes.bowl(), BLUE),
-        standing(shipped_mesh("bear"), WHITE, (0, 0.13, 0), 1.1, rotation=(0, 130, 0)),
-    ]
+    bodies = [body(shapes.bowl(), BLUE), standing(shipped_mesh("bear"), WHITE, (0, 0.13, 0), 1.1, rotation=(0, 130, 0))]
     return seen([*bodies, ground()], ws.synthetic_sky(HIGH_SUN), size, (1.4, 2.7, 3.4), (0, 0.45, 0))
 
 

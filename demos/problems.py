@@ -202,10 +202,7 @@ def pose_case(
     target = inverse.Target(ray_traced(truth), ground_alone(truth) if is_shadow_alone else None)
     problem = inverse.Problem(start, target, inverse.Pose(0), inverse.Loss("huber"))
     return Case(
-        problem,
-        truth,
-        inverse.pose_stages(problem),
-        lambda scene: pose_errors(scene.bodies[0], truth.bodies[0]),
+        problem, truth, inverse.pose_stages(problem), lambda scene: pose_errors(scene.bodies[0], truth.bodies[0])
     )
 
 

@@ -105,9 +105,7 @@ def poisoned_outputs(monkeypatch):
 
     monkeypatch.setattr(wp, "empty", poisoned)
     monkeypatch.setattr(
-        wp,
-        "empty_like",
-        lambda a, **options: poisoned(a.shape, **{"dtype": a.dtype, "device": a.device} | options),
+        wp, "empty_like", lambda a, **options: poisoned(a.shape, **{"dtype": a.dtype, "device": a.device} | options)
     )
 
 

@@ -27,18 +27,12 @@ MIXED = MixedRenderer([TorchRenderer(SCENE)])
         (lambda: ws.render(SCENE, camera=SCENE.camera), r"render: unknown argument 'camera' \(write Scene\(…, camera="),
         (lambda: ws.Renderer(SCENE, camera=SCENE.camera), r"unknown argument 'camera' \(write cameras=\[camera\]"),
         (lambda: ws.synthetic_sky(sun=(0, 1, 0)), r"synthetic_sky: unknown argument 'sun' \(write sun_direction="),
-        (
-            lambda: ws.synthetic_sky((0, 1, 0), 3.0),
-            "too many positional arguments; .* are sun_direction, sun_strength",
-        ),
+        (lambda: ws.synthetic_sky((0, 1, 0), 3.0), "too many positional arguments; .* are sun_direction, sun_strength"),
         (
             lambda: ws.Renderer(SCENE).render(cameras=[SCENE.camera]),
             r"unknown argument 'cameras' \(write renderer.with_cameras\(",
         ),
-        (
-            lambda: TorchRenderer(SCENE)(cameras=[SCENE.camera]),
-            r"\(write TorchRenderer\(.*clip_matrices=",
-        ),
+        (lambda: TorchRenderer(SCENE)(cameras=[SCENE.camera]), r"\(write TorchRenderer\(.*clip_matrices="),
         (lambda: TorchRenderer(SCENE)(vertices=None), r"\(write geometry=renderer.placed\(.*renderer.deformed\("),
         (lambda: ws.Body(BALL.mesh, size=2), r"Body: unknown argument 'size' \(write Body\(…\).on_ground\(size=…\)\)"),
         (
@@ -57,10 +51,7 @@ MIXED = MixedRenderer([TorchRenderer(SCENE)])
         (lambda: inverse.Problem(SCENE, target=None), r"Problem: .* 'target' \(did you mean 'targets'\?\)"),
         (lambda: ws.Body(), "Body: missing a required argument: 'mesh'"),
         (lambda: inverse.Sun((0, 1, 0), intensity=3), r"Sun: unknown argument 'intensity' \(write irradiance\)"),
-        (
-            lambda: inverse.Sun((0, 1, 0), 3, radius=2),
-            r"unknown .* \(write angular_radius, in degrees\)",
-        ),
+        (lambda: inverse.Sun((0, 1, 0), 3, radius=2), r"unknown .* \(write angular_radius, in degrees\)"),
         (lambda: inverse.Sun((0, 1, 0)), "missing a required argument: 'irradiance'; its arguments are direction, irr"),
         (lambda: inverse.Stage(lr=0.1), r"Stage: unknown argument 'lr' \(write learning_rate\)"),
         (
@@ -74,17 +65,7 @@ def test_arguments_that_do_not_fit_are_told_with_those_that_do(call, message):
         call()
 
 
-_RESULTS = {
-    "Ending",
-    "Fit",
-    "FoundLight",
-    "Geometry",
-    "PoseUncertainty",
-    "Recipe",
-    "Result",
-    "Tuning",
-    "Uncertainty",
-}
+_RESULTS = {"Ending", "Fit", "FoundLight", "Geometry", "PoseUncertainty", "Recipe", "Result", "Tuning", "Uncertainty"}
 """Public dataclasses that functions return."""
 
 

@@ -57,10 +57,7 @@ class FreePose:
     """
 
     def __init__(
-        self,
-        renderer: ws.Renderer,
-        turn: Sequence[float] = (0.0, 0.0, 0.0),
-        shift: Sequence[float] = (0.0, 0.0, 0.0),
+        self, renderer: ws.Renderer, turn: Sequence[float] = (0.0, 0.0, 0.0), shift: Sequence[float] = (0.0, 0.0, 0.0)
     ):
         self.renderer = renderer
         translation = renderer.scene.bodies[0].translation + shift

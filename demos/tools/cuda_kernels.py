@@ -58,12 +58,7 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     **{f"_make_evaluate_rotated {order}": partial(lobes._make_evaluate_rotated, order) for order in ORDERS},
     **{
         f"{make.__name__} {dtype.__name__}": partial(make, dtype)
-        for make in (
-            _make_interpolate,
-            batch._make_add,
-            smooth._make_blend,
-            smooth._make_blend_adjoint,
-        )
+        for make in (_make_interpolate, batch._make_add, smooth._make_blend, smooth._make_blend_adjoint)
         for dtype in (wp.float32, wp.vec4)
     },
     **{f"_make_copy {dtype.__name__}": partial(batch._make_copy, dtype) for dtype in (wp.float32, wp.vec3)},

@@ -95,8 +95,7 @@ def test_harmonics_have_an_order_that_the_kernels_are_made_for(order):
 
 
 @pytest.mark.parametrize(
-    ("basis", "remedy"),
-    [(5, r"HarmonicBasis\(5\)"), ("sh", "CellBasis"), (HarmonicBasis, "the class HarmonicBasis")],
+    ("basis", "remedy"), [(5, r"HarmonicBasis\(5\)"), ("sh", "CellBasis"), (HarmonicBasis, "the class HarmonicBasis")]
 )
 def test_what_is_no_basis_is_refused_with_how_to_make_one(basis, remedy):
     check_basis(None)

@@ -176,11 +176,7 @@ def test_rays_pass_through_the_centers_of_their_pixels(seed):
 
 def test_clip_space_is_minus_one_at_the_left_and_top_edge_and_depth_falls_from_one_at_the_near_plane():
     camera = Camera(INTRINSICS, np.eye(3), np.zeros(3), *SIZE, near=0.25)
-    ray = np.linalg.inv(INTRINSICS) @ [
-        [0.0, 96.0],
-        [0.0, 64.0],
-        [1.0, 1.0],
-    ]  # top-left and bottom-right corner
+    ray = np.linalg.inv(INTRINSICS) @ [[0.0, 96.0], [0.0, 64.0], [1.0, 1.0]]  # top-left and bottom-right corner
     for distance in (0.25, 1.0, 1e6):
         points = np.vstack([ray * distance, np.ones(2)])
         clip = camera.clip_matrix() @ points

@@ -67,13 +67,7 @@ def test_a_part_is_chosen_by_name_or_index_and_the_first_by_default(tmp_path):
         OpenEXR.Part({**header, "name": name}, {"RGB": PIXELS + i}, name) for i, name in enumerate(["left", "right"])
     ]
     OpenEXR.File(parts).write(str(path))
-    for part, expected in (
-        (None, PIXELS),
-        (0, PIXELS),
-        ("left", PIXELS),
-        (1, PIXELS + 1),
-        ("right", PIXELS + 1),
-    ):
+    for part, expected in ((None, PIXELS), (0, PIXELS), ("left", PIXELS), (1, PIXELS + 1), ("right", PIXELS + 1)):
         np.testing.assert_array_equal(read_image(path, part=part), expected)
     for part in ("middle", 2, -1):
         with pytest.raises(ImageError, match=f"got part {part!r}, expected 0 to 1 or one of 'left', 'right'"):

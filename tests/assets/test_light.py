@@ -184,16 +184,7 @@ def test_a_file_of_integers_that_is_white_somewhere_cuts_a_sun_off_and_a_warning
         EnvironmentMap.read(tmp_path / "sky.exr")
 
 
-MAPS = [
-    "apartment.exr",
-    "city.exr",
-    "dawn.exr",
-    "forest.exr",
-    "night.exr",
-    "studio.exr",
-    "sunset.exr",
-    "venice.exr",
-]
+MAPS = ["apartment.exr", "city.exr", "dawn.exr", "forest.exr", "night.exr", "studio.exr", "sunset.exr", "venice.exr"]
 
 
 @pytest.mark.parametrize("name", [*MAPS, "workshop.hdr"])

@@ -54,10 +54,7 @@ def write(folder, name, text):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ([[0, 0, 0], [0, np.nan, 0], [0, 0, np.inf]], [[0, 1, 2]]),
-            r"positions: .* at 2 of 3 \(first at vertex 1: ",
-        ),
+        (([[0, 0, 0], [0, np.nan, 0], [0, 0, np.inf]], [[0, 1, 2]]), r"positions: .* at 2 of 3 \(first at vertex 1: "),
         (([[1e39, 0, 0]] * 3, [[0, 1, 2]]), r"first at vertex 0: \[inf.*expected finite numbers"),
         (([[0, 0, 0], [0, 2e18, 0]], [[0, 1, 1]]), r"numbers beyond 1e\+18 at 1 of 2 \(first at vertex 1: "),
         ((TRIANGLE, [[0, 1, 2], [0, 1, 3]]), r"faces: got 1 .*face 1: vertex 3\), expected 0 to 2"),

@@ -96,10 +96,7 @@ def test_any_rgbe_survives_run_length_encoding(tmp_path_factory, seed, width):
     ("change", "message"),
     [
         ({"header": "P6\n"}, "not a Radiance file"),
-        (
-            {"header": "#?RADIANCE\nFORMAT=32-bit_rle_xyze\n"},
-            "got format 32-bit_rle_xyze, expected 32-bit_rle_rgbe",
-        ),
+        ({"header": "#?RADIANCE\nFORMAT=32-bit_rle_xyze\n"}, "got format 32-bit_rle_xyze, expected 32-bit_rle_rgbe"),
         ({"header": "#?RADIANCE\nEXPOSURE=0\n"}, "got EXPOSURE=0, expected positive"),
         ({"header": "#?RADIANCE\nEXPOSURE=much\n"}, "got EXPOSURE=much, expected positive"),
         ({"resolution": "-Y 6"}, "got resolution line b'-Y 6"),

@@ -446,10 +446,7 @@ def test_an_unknown_device_names_the_known_ones(scene, tmp_path, command, name):
         (("render", "scene.toml", "-o", "x.exr", "--colour", "red"), "--colour"),
         (("render", "cow.obj", "-o", "x.exr", "--width", "200"), "No such option: --width (write --size WIDTH HEIGHT)"),
         (("tune", "cow.obj", "--height=200"), "No such option: --height (write --size WIDTH HEIGHT)"),
-        (
-            ("render", "scene.toml", "-o", "x.exr", "--bounces", "2.5"),
-            "got '2.5', expected a whole number",
-        ),
+        (("render", "scene.toml", "-o", "x.exr", "--bounces", "2.5"), "got '2.5', expected a whole number"),
         (("render", "scene.toml", "-o", "x.exr", "--bounces", "-1"), "got -1, expected a whole number from 0"),
         (("tune", "scene.toml", "--error", "0.1", "--bounces", "17"), "17, expected a whole number from 0 to 16"),
         (("envmap", "x.exr", "--order", "9"), "order"),

@@ -70,10 +70,7 @@ def test_what_is_not_finite_agrees_with_nothing():
         ),
         ({"sanitizer": "failed (9): Invalid __global__ read"}, "sanitizer: failed (9): Invalid __global__ read"),
         ({"tests": {"passed": 3, "failed": ["test_sh.test_it"], "skipped": 0, "not reached": 0}}, "test_sh.test_it"),
-        (
-            {"tests": {"passed": 3, "failed": [], "skipped": 0, "not reached": 2}},
-            "tests: 2 were not reached",
-        ),
+        ({"tests": {"passed": 3, "failed": [], "skipped": 0, "not reached": 2}}, "tests: 2 were not reached"),
         ({"benchmark": {"error": "RuntimeError: out of memory"}}, "benchmark: RuntimeError: out of memory"),
     ],
 )

@@ -311,10 +311,7 @@ def test_the_death_of_the_head_of_a_ray_cluster_is_an_error(cluster, monkeypatch
 
 def test_others_do_not_write_into_the_folder_meanwhile(photos, tmp_path):
     (tmp_path / "results").mkdir()
-    with (
-        checkpoint.exclusive(tmp_path / "results" / many.TABLE),
-        pytest.raises(inverse.CheckpointError, match="table"),
-    ):
+    with checkpoint.exclusive(tmp_path / "results" / many.TABLE), pytest.raises(inverse.CheckpointError, match="table"):
         inverse.fit_many([photos / "a" / "fit.toml"], tmp_path / "results", progress=False)
 
 

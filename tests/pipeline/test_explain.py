@@ -466,11 +466,7 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
     if module.startswith(of_visibility) or key == "_add_cached_rows":
         return VISIBILITY
     if module.startswith("stages.silhouettes"):
-        after = {
-            "_find_edge_colors": "radiance",
-            "blend": "smoothing",
-            "_measure_areas_adjoint": "smoothing",
-        }
+        after = {"_find_edge_colors": "radiance", "blend": "smoothing", "_measure_areas_adjoint": "smoothing"}
         return next((name for part, name in after.items() if part in key), "silhouettes")
     if module.startswith("stages.textures"):
         if "_sample" in key:  # given the samples of white surfaces, it exposes them
@@ -574,11 +570,7 @@ def radii_fit(renderer):
     radii = wp.clone(radii, requires_grad=True) if radii.size else radii
     geometry = Geometry(positions, centers, radii)
     variables = [radii] if radii.size else []
-    return (
-        lambda: renderer.draw(view=renderer.view(geometry)),
-        variables,
-        lambda: renderer.explain(geometry=geometry),
-    )
+    return (lambda: renderer.draw(view=renderer.view(geometry)), variables, lambda: renderer.explain(geometry=geometry))
 
 
 def camera_fit(renderer):

@@ -134,11 +134,7 @@ def test_a_plane_in_which_a_body_stands_deep_is_its_ground_still(fitted):
 
 
 @pytest.mark.parametrize(
-    ("name", "others"),
-    [
-        ("bodies on both sides of it", [(0, 1.5, 0), (0, -1.5, 0)]),
-        ("nothing else", []),
-    ],
+    ("name", "others"), [("bodies on both sides of it", [(0, 1.5, 0), (0, -1.5, 0)]), ("nothing else", [])]
 )
 def test_a_plane_that_is_no_ground_is_fitted_as_any_mesh(fitted, name, others):
     spheres_of(ws.Body(ws.plane(8.0, 2), blockers=9), *(ball(translation=place) for place in others))

@@ -46,10 +46,7 @@ def test_narrow_lobes_have_finer_cells_unless_a_number_is_given(roughness, given
             {"roughness": np.zeros((7, 7, 1))},
             r"roughness: got shape \(7, 7, 1\), expected .* or a texture \[height, width",
         ),
-        (
-            {"roughness": 0.5, "metallic": np.zeros((4, 4))},
-            r"metallic: got an image, but mesh .* has no uvs",
-        ),
+        ({"roughness": 0.5, "metallic": np.zeros((4, 4))}, r"metallic: got an image, but mesh .* has no uvs"),
         ({"metallic": 1.0}, "metallic: got 1.0 without roughness, expected roughness, too, such as 0.3"),
         ({"roughness": 0.5, "receivers": "vertex"}, "receivers: got 'vertex' beside roughness"),
     ],

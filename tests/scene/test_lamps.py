@@ -91,10 +91,7 @@ NODES = [
     {"name": "parent", "translation": [0, 3, 0], "rotation": [-HALF, 0, 0, HALF], "scale": [2, 2, 2], "children": [1]},
     {"name": "down", "translation": [1, 0, 0], "extensions": {"KHR_lights_punctual": {"light": 1}}},
     {"translation": [4, 5, 6], "extensions": {"KHR_lights_punctual": {"light": 0}}},
-    {
-        "matrix": [0, 0, 1, 0, 0, 1, 0, 0, -1, 0, 0, 0, 7, 8, 9, 1],
-        "extensions": {"KHR_lights_punctual": {"light": 2}},
-    },
+    {"matrix": [0, 0, 1, 0, 0, 1, 0, 0, -1, 0, 0, 0, 7, 8, 9, 1], "extensions": {"KHR_lights_punctual": {"light": 2}}},
     {"rotation": [-HALF, 0, 0, HALF], "extensions": {"KHR_lights_punctual": {"light": 3}}},
     {"name": "of no scene", "extensions": {"KHR_lights_punctual": {"light": 0}}},
 ]

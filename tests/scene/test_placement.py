@@ -76,8 +76,7 @@ def ball(height, **options):
 
 
 @pytest.mark.parametrize(
-    ("height", "said"),
-    [(-0.5, None), (0.4, None), (0.6, "floats 1.1 above"), (-1.4, None), (-1.6, "lies 1.1 below")],
+    ("height", "said"), [(-0.5, None), (0.4, None), (0.6, "floats 1.1 above"), (-1.4, None), (-1.6, "lies 1.1 below")]
 )
 def test_a_body_that_floats_or_lies_below_by_more_than_its_size_is_remarked_on(height, said):
     remarks = misplacements(ws.Scene([GROUND, ball(height)], LIGHT))

@@ -457,10 +457,7 @@ def test_an_array_given_to_a_body_is_copied():
         ({"bodies": ()}, "bodies: got none"),
         ({"bodies": ws.Body(ws.icosphere(1.0, 0))}, "bodies: got Body, expected a list"),
         ({"bodies": [ws.icosphere(1.0, 0)]}, r"bodies\[0\]: got Mesh, expected a Body"),
-        (
-            {"light": None},
-            r"light: got None, expected an EnvironmentMap .*, or the path of a map",
-        ),
+        ({"light": None}, r"light: got None, expected an EnvironmentMap .*, or the path of a map"),
         ({"light": 1.0}, r"light: got shape \(\), .*EnvironmentMap.constant"),
         ({"light": np.ones((4, 8, 3))}, r"light: got shape \(4, 8, 3\), .*EnvironmentMap\(pixels\)"),
         ({"light": np.ones((100, 3))}, "light: order: got 10, expected a number of bands from 2 to 8"),
@@ -468,10 +465,7 @@ def test_an_array_given_to_a_body_is_copied():
         ({"camera": [ws.Camera.look_at((0, 0, 3), (0, 0, 0))] * 2}, r"camera: got list .*Renderer\(scene, cameras="),
         ({"visibility": "log-sh"}, "visibility: got 'log-sh', expected a Visibility"),
         ({"supersampling": 2.0}, "supersampling: got 2.0"),
-        (
-            {"light": np.ones((5, 3))},
-            r"light: got shape \(5, 3\), expected .*, or SH coefficients \[order², 3\]",
-        ),
+        ({"light": np.ones((5, 3))}, r"light: got shape \(5, 3\), expected .*, or SH coefficients \[order², 3\]"),
         ({"light": np.full((4, 3), np.nan)}, "light: got 12 NaN"),
         ({"supersampling": 0}, "supersampling: got 0"),
         ({"supersampling": True}, "supersampling: got True"),

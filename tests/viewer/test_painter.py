@@ -8,15 +8,7 @@ import pytest
 import warpshadow as ws
 from warpshadow.scene.visibility import Visibility
 from warpshadow.viewer.page_camera import PageCamera
-from warpshadow.viewer.painter import (
-    Painter,
-    bounds,
-    distances,
-    error_picture,
-    own_page,
-    picture,
-    relative_error,
-)
+from warpshadow.viewer.painter import Painter, bounds, distances, error_picture, own_page, picture, relative_error
 from warpshadow.viewer.quality import Quality
 from warpshadow.viewer.state import ERROR, BodyGloss, BodyPose, ViewerState
 

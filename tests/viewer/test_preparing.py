@@ -15,10 +15,7 @@ from warpshadow.viewer.app import ViewerApp
 from warpshadow.viewer.painter import Painter
 from warpshadow.viewer.preparing import Preparation, is_cached_on_disk
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")]
 
 LONG = 10 * PATIENCE  # a process compiles kernels
 

@@ -152,12 +152,7 @@ class EnvironmentMap:
 
     @classmethod
     def constant(
-        cls,
-        rgb: npt.ArrayLike = 1.0,
-        height: int = 16,
-        *,
-        radius: float | None = None,
-        center: npt.ArrayLike = _ORIGIN,
+        cls, rgb: npt.ArrayLike = 1.0, height: int = 16, *, radius: float | None = None, center: npt.ArrayLike = _ORIGIN
     ) -> EnvironmentMap:
         """Make a map of the same radiance everywhere, one number or RGB; radius and center as for the class."""
         check.integer("height", height, unit="rows")

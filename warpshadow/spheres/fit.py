@@ -269,10 +269,7 @@ def _fit(
         unfinished.keep(lambda: {"seconds": seconds, **arrays}, part)
 
     # threads for products of such small matrices wait for each other, for seconds where cores are busy
-    with (
-        progress_bar(total, label, "step", done=done_steps, shows=progress) as bar,
-        threadpool_limits(limits=1),
-    ):
+    with progress_bar(total, label, "step", done=done_steps, shows=progress) as bar, threadpool_limits(limits=1):
         if count:
             for descent_state in _descend(mesh, fit_key, count, cached_arrays, store_part):
                 spheres = descent_state

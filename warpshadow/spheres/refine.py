@@ -176,16 +176,7 @@ def _make_project_adjoint(lanes: int) -> wp.Kernel:
             adj_opacity[lane] = -gradient[5]
             slope[lane] = edge[1]
         adj_offset, adj_radius, _, _, _ = sphere_adjoint(
-            sphere_view,
-            sine,
-            low,
-            Lane(cos_width),
-            Lane(sin_width),
-            slope,
-            adj_opacity,
-            sum_,
-            sum_t,
-            Vectors(x, y, z),
+            sphere_view, sine, low, Lane(cos_width), Lane(sin_width), slope, adj_opacity, sum_, sum_t, Vectors(x, y, z)
         )
         adj_balls[block, sphere] = wp.vec4(
             total(dot(frame_axis(frame_rows, block, 3, 3), adj_offset)),
@@ -278,12 +269,7 @@ return sums;
 
 @wp.func_native(_EDGE_SUMS)
 def _edge_sums(
-    axis: wp.vec3,
-    edge: wp.vec3,
-    reached: int,
-    directions: wp.array2d[_Bundle],
-    upstream: wp.array2d[_Bundle],
-    i: int,
+    axis: wp.vec3, edge: wp.vec3, reached: int, directions: wp.array2d[_Bundle], upstream: wp.array2d[_Bundle], i: int
 ) -> _Sums: ...
 
 

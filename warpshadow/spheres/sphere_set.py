@@ -70,11 +70,7 @@ class Spheres:
         return f"Spheres({len(self)})"
 
     def transformed(
-        self,
-        *,
-        rotation: npt.ArrayLike | None = None,
-        translation: npt.ArrayLike = (0, 0, 0),
-        scale: float = 1.0,
+        self, *, rotation: npt.ArrayLike | None = None, translation: npt.ArrayLike = (0, 0, 0), scale: float = 1.0
     ) -> Spheres:
         """Apply a similarity x → scale · R x + t.
 

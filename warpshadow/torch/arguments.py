@@ -97,11 +97,7 @@ class Arguments:
         return _filled(value, arrays)
 
     def apply(
-        self,
-        function: Callable[..., Any],
-        *inputs: Any,
-        affine: Collection[str] = (),
-        replays: Replays | None = None,
+        self, function: Callable[..., Any], *inputs: Any, affine: Collection[str] = (), replays: Replays | None = None
     ) -> Any:
         """Apply a function of inputs, as :func:`~warpshadow.torch.apply` does, or replay it if there are replays.
 

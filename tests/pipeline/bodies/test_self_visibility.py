@@ -330,10 +330,7 @@ def test_what_was_traced_at_an_interrupt_is_not_traced_again(tmp_path, monkeypat
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path / "whole"))
     whole, all_blocks = rows(), blocks[:]
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path / "interrupted"))
-    with (
-        monkeypatch.context() as patch,
-        pytest.raises(KeyboardInterrupt, match="^192 of 642 points of the self-"),
-    ):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt, match="^192 of 642 points of the self-"):
         patch.setattr(progress, "Wait", Interrupting)
         rows()
     (part,) = cached_files("own_shadows")

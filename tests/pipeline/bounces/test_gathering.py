@@ -11,11 +11,7 @@ from warpshadow.tuning.timing import whole_image
 
 @pytest.mark.parametrize(
     ("method", "self_shadows", "roughness", "is_deformed"),
-    [
-        ("log-sh", "traced", None, False),
-        ("directional", "spheres", None, False),
-        ("directional", "traced", 0.4, True),
-    ],
+    [("log-sh", "traced", None, False), ("directional", "spheres", None, False), ("directional", "traced", 0.4, True)],
 )
 def test_cameras_that_see_one_geometry_by_pixel_have_their_own_images(method, self_shadows, roughness, is_deformed):
     ball = ws.Body(ws.icosphere(0.8, 1), translation=(0, 0.8, 0), receivers="pixel", roughness=roughness)

@@ -65,10 +65,7 @@ def texel_width(*others: ws.Body) -> float:
 
 @pytest.mark.parametrize(
     "others",
-    [
-        [ball(translation=(2, 1, 0))],
-        [ws.Body(box(), translation=(x, 0.5, 0)) for x in (-6, 6)],
-    ],
+    [[ball(translation=(2, 1, 0))], [ws.Body(box(), translation=(x, 0.5, 0)) for x in (-6, 6)]],
     ids=["two contacts", "a small body"],
 )
 def test_texels_are_small_around_the_one_contact_of_a_large_body_alone(others):

@@ -198,8 +198,7 @@ def samples_of(device, uvs, probes=(0.0, 0.0, 1.0, 1.0)):
     probes = np.broadcast_to(probes, (len(uvs), 4))
     shape = (1, 1, len(uvs))
     fragments = Fragments(
-        wp.zeros(shape, dtype=wp.int32, device=device),
-        wp.full(shape, wp.vec3(1 / 3), dtype=wp.vec3, device=device),
+        wp.zeros(shape, dtype=wp.int32, device=device), wp.full(shape, wp.vec3(1 / 3), dtype=wp.vec3, device=device)
     )
     footprints = Footprints(
         wp.zeros(shape, dtype=wp.int32, device=device),

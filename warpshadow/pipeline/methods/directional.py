@@ -40,11 +40,7 @@ from warpshadow.stages.self_visibility.gather import multiply_transmittances
 from warpshadow.stages.self_visibility.sun_cells import trace_sun_cells
 from warpshadow.stages.visibility import directional
 from warpshadow.stages.visibility.directional import SOFTNESS
-from warpshadow.stages.visibility.sharp_cells import (
-    RADII_PER_HALF_ANGLE,
-    SharpCells,
-    blend_sharp_cells,
-)
+from warpshadow.stages.visibility.sharp_cells import RADII_PER_HALF_ANGLE, SharpCells, blend_sharp_cells
 
 
 class Directional(SphereMethod[ProjectedCells, CellVisibility]):

@@ -90,11 +90,7 @@ def _with_middles(corners: np.ndarray) -> np.ndarray:
 
 
 def _irradiance(
-    mesh: wp.Mesh | None,
-    points: np.ndarray,
-    normals: np.ndarray,
-    light: KnownLight,
-    device: wp.Device,
+    mesh: wp.Mesh | None, points: np.ndarray, normals: np.ndarray, light: KnownLight, device: wp.Device
 ) -> np.ndarray:
     """Luminance of the light that reaches points, [face, point], of rays that are shared out by the light of cells."""
     cell_light = light.cells(fibonacci(_CELLS))

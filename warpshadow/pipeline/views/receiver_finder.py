@@ -34,11 +34,7 @@ class ReceiverFinder:
     """
 
     def __init__(
-        self,
-        method: Method,
-        blocker_kinds: BlockerKinds,
-        static_bodies: StaticBodies | None,
-        supersampling: int,
+        self, method: Method, blocker_kinds: BlockerKinds, static_bodies: StaticBodies | None, supersampling: int
     ):
         self._method, self._blocker_kinds, self._static_bodies = method, blocker_kinds, static_bodies
         self._merged_scene = method.merged_scene
@@ -77,13 +73,7 @@ class ReceiverFinder:
             numbering = self._number_seen(seen_vertices(fragments, silhouettes, positions.shape[1]), has_cached_rows)
             if spheres is not None and (is_adaptive := method.is_adaptive & at_samples).any():
                 surfaces = VisibleSurfaces(
-                    positions,
-                    normals,
-                    fragments,
-                    spheres,
-                    is_adaptive,
-                    self._supersampling,
-                    footprints_of,
+                    positions, normals, fragments, spheres, is_adaptive, self._supersampling, footprints_of
                 )
                 quadtree = method.find_squares(self._blocker_kinds, surfaces)
         if at_samples.any() and fragments.barycentrics.requires_grad:

@@ -125,13 +125,7 @@ def _mean_radiance(textures: EmissionTextures) -> np.ndarray:
 
 @wp.func
 def light_of_point(
-    emitters: EmittingFaces,
-    mesh: wp.uint64,
-    point: wp.vec3,
-    normal: wp.vec3,
-    share: float,
-    u: float,
-    v: float,
+    emitters: EmittingFaces, mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, share: float, u: float, v: float
 ):
     """Light of a point of the emitters on a receiver over the point's density, given three numbers even in [0, 1)."""
     index = wp.lower_bound(emitters.distribution, share)

@@ -137,10 +137,7 @@ def find_blocked_radiance(bounced_light: wp.array, direct: wp.array, openness: w
     count = common_batch({"bounced_light": bounced_light, "direct": direct, "openness": openness})
     blocked_light = wp.empty((count, bounced_light.shape[1]), dtype=wp.vec3, device=bounced_light.device)
     launch(
-        _find_blocked_radiance,
-        blocked_light.shape,
-        inputs=[bounced_light, direct, openness],
-        outputs=[blocked_light],
+        _find_blocked_radiance, blocked_light.shape, inputs=[bounced_light, direct, openness], outputs=[blocked_light]
     )
     return blocked_light
 

@@ -48,11 +48,7 @@ class PlaneArrays:
 
 
 def check_planes(
-    planes: PlaneBlockers,
-    points: wp.array,
-    frames: wp.array,
-    directions: np.ndarray,
-    skip: int | None,
+    planes: PlaneBlockers, points: wp.array, frames: wp.array, directions: np.ndarray, skip: int | None
 ) -> None:
     """Raise ValueError for arrays that do not fit together."""
     check.shape("points", points.shape, ("batch", "receiver"))

@@ -166,9 +166,7 @@ def _front_by_height(height: float, margin: float, side_of_body: float, facing_c
     front = wp.where(height > 0.0, 1.0, 0.0)
     if wp.abs(height) < 2.0 * margin:
         front = wp.smoothstep(
-            -1.0,
-            1.0,
-            side_of_body + (1.0 - side_of_body * side_of_body) * facing_cosine + _over_margin(height, margin),
+            -1.0, 1.0, side_of_body + (1.0 - side_of_body * side_of_body) * facing_cosine + _over_margin(height, margin)
         )
     return front
 

@@ -24,11 +24,7 @@ from warpshadow.device.memory import empty
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.cell_coverage import ViewedEdge
 from warpshadow.stages.planes.cells import PlaneArrays, check_planes, plane_arrays
-from warpshadow.stages.planes.coverage import (
-    horizon_normal,
-    side_coverage,
-    side_coverage_adjoint,
-)
+from warpshadow.stages.planes.coverage import horizon_normal, side_coverage, side_coverage_adjoint
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers
 from warpshadow.stages.planes.sides import (
     PlaneInputs,

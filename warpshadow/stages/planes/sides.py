@@ -121,9 +121,7 @@ def _position_on_side(side: PlaneSide):
     height = wp.where(side.is_back, -position[2], position[2])
     front_ramp = wp.clamp(height / margin, 0.0, 2.0)
     return wp.vec3(
-        position[0],
-        position[1],
-        margin * (1.0 + 0.25 * front_ramp * front_ramp) + wp.max(height - 2.0 * margin, 0.0),
+        position[0], position[1], margin * (1.0 + 0.25 * front_ramp * front_ramp) + wp.max(height - 2.0 * margin, 0.0)
     )
 
 
@@ -242,11 +240,7 @@ def _with_side(
 
 @wp.func
 def prepare_receiver(
-    row: int,
-    worker: int,
-    inputs: PlaneInputs,
-    sides: wp.array2d(dtype=StoredSide),
-    edges: wp.array2d(dtype=ViewedEdge),
+    row: int, worker: int, inputs: PlaneInputs, sides: wp.array2d(dtype=StoredSide), edges: wp.array2d(dtype=ViewedEdge)
 ):
     """Store the sides of planes that a receiver may hit, and where it is relative to them, in scratch memory."""
     receiver = PlaneReceiver()
@@ -380,10 +374,7 @@ def inverse_distance_on_side(side: PlaneSide):
 
 @wp.func
 def inverse_distance_on_side_adjoint(
-    side: PlaneSide,
-    inverse_distance: wp.vec3,
-    adj_inverse_distance: wp.vec3,
-    sides: wp.array(dtype=StoredSide),
+    side: PlaneSide, inverse_distance: wp.vec3, adj_inverse_distance: wp.vec3, sides: wp.array(dtype=StoredSide)
 ):
     """Add to the gradients of the local receiver."""
     height = _position_on_side(side)[2]

@@ -203,17 +203,7 @@ def mean_fragments(
         lambda adj_means: launch(
             _find_means_adjoint,
             samples.shape,
-            inputs=[
-                sides,
-                owner_samples,
-                is_corner,
-                samples,
-                counts,
-                has_mean_slope,
-                width,
-                supersampling,
-                adj_means,
-            ],
+            inputs=[sides, owner_samples, is_corner, samples, counts, has_mean_slope, width, supersampling, adj_means],
             outputs=[barycentrics.grad],
         ),
         result=empty(samples.shape, dtype=wp.vec3, device=device),

@@ -46,11 +46,7 @@ def _area_weight(shares: wp.array(dtype=wp.vec3), direction: int):
 
 @wp.func
 def find_image_weight(
-    sample: int,
-    entry: int,
-    entries: wp.array(dtype=wp.int32),
-    shares: wp.array2d(dtype=wp.vec3),
-    width: int,
+    sample: int, entry: int, entries: wp.array(dtype=wp.int32), shares: wp.array2d(dtype=wp.vec3), width: int
 ):
     """Weight of a sample that has an entry in all of the smoothed image: of its own color, and in its neighbors'."""
     weight = float(1.0)

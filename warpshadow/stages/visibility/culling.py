@@ -106,12 +106,7 @@ def make_cap_functions(has_horizon: bool, lanes: int, has_footprints: bool = Fal
 
     @wp.func(inline=True)
     def widen_cone(
-        axis: Vectors,
-        cosine: Lane,
-        sine: Lane,
-        squared_distance: Lane,
-        receivers: ReceiverLanes,
-        cells: DirectionCells,
+        axis: Vectors, cosine: Lane, sine: Lane, squared_distance: Lane, receivers: ReceiverLanes, cells: DirectionCells
     ):
         cos_width = Lane(cells.cos_width)
         sin_width = Lane(cells.sin_width)

@@ -156,11 +156,7 @@ def blend_sharp_cells(
             _blend_sharp_cells, row_count, inputs=[sharp_cells, *inputs], outputs=[result], cost=cost
         ),
         lambda adj_blended: launch(
-            _blend_sharp_cells_adjoint,
-            row_count,
-            inputs=inputs,
-            outputs=[adj_blended, sharp_cells.grad],
-            cost=cost,
+            _blend_sharp_cells_adjoint, row_count, inputs=inputs, outputs=[adj_blended, sharp_cells.grad], cost=cost
         ),
         result=blended,
         variables=[transmittance, sharp_cells],
