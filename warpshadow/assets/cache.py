@@ -1,7 +1,5 @@
 """The cache on disk: results that take long to compute, finished or interrupted, by a hash of all their inputs."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

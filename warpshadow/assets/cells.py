@@ -1,7 +1,5 @@
 """The light of cells of directions, gathered from an environment map."""
 
-from __future__ import annotations
-
 import functools
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Materials and lights of glTF, as trimesh reads them and as it does not."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

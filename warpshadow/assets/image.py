@@ -3,8 +3,6 @@
 Row 0 is the top. PNG, JPEG and TIFF hold sRGB, which is decoded and encoded exactly; alpha is linear everywhere.
 """
 
-from __future__ import annotations
-
 import functools
 import io
 import sys

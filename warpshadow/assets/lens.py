@@ -1,7 +1,5 @@
 """Lenses: images of a pinhole from images of a lens with distortion, by OpenCV's five coefficients."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

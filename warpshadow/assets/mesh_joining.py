@@ -1,7 +1,5 @@
 """Joining the parts of a mesh file: into one mesh with one picture, gloss and colors."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """OBJ files: their items, and materials' pictures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Pictures: linear images as they are shown, exposed, on a background, in 8 bits of sRGB."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable

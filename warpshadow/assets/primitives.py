@@ -1,7 +1,5 @@
 """Primitives: planes, grounds and spheres."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Raw files of cameras, developed by LibRaw."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

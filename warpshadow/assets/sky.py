@@ -1,7 +1,5 @@
 """Skies: environment maps made of formulas."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Unwrapping: texture coordinates for a mesh that has none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

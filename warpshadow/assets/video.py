@@ -1,7 +1,5 @@
 """Videos: pictures one after another."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The scenes of a recipe, by their numbers, and which meshes and maps each split draws from."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import itertools

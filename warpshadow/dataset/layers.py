@@ -1,7 +1,5 @@
 """Layers of pixels: the images that a data set may hold. ``LAYERS`` says how each is found, and how PNG has it."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple

@@ -10,8 +10,6 @@ Nothing is cut off: a range is as wide, and an exposure as low, as an image need
 not, becomes 0: it is said of which part of the pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol

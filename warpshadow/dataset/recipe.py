@@ -1,7 +1,5 @@
 """Recipes: TOML files that describe a data set, checked key by key (README.md lists the keys)."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

@@ -7,8 +7,6 @@ A sample has a key, the number of its image in nine digits, and these files:
     KEY.json         how the scene was drawn; README.md lists its keys
 """
 
-from __future__ import annotations
-
 import io
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Shards: plain .tar files of samples, in the format of WebDataset, each written once, whole, with the same bits."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import gc

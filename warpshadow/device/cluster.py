@@ -1,7 +1,5 @@
 """Ray clusters: run the tasks of :mod:`warpshadow.device.workers` on the machines of a cluster."""
 
-from __future__ import annotations
-
 import itertools
 import logging
 import socket

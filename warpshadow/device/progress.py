@@ -5,8 +5,6 @@ threads. Lines tell of a call of a renderer that lasts ten seconds by itself: ba
 nothing.
 """
 
-from __future__ import annotations
-
 import builtins
 import contextlib
 import itertools

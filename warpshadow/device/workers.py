@@ -4,8 +4,6 @@ Each process has a share of the threads of :mod:`warpshadow.device.parallel`, do
 caches and compiled kernels. A process that dies, killed or out of memory, takes no other with it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import multiprocessing
 import os

@@ -6,8 +6,6 @@ that stands on a plane keeps three: it turns about the plane's normal and slides
 vertex; fixed coordinates of its middle stay, and so it moves onto the plane along the other coordinates.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The descent: from where a problem's scene is to where its images are like their targets."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import statistics

@@ -2,8 +2,6 @@
 exposure, images that are not explained, a loss that was still falling.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

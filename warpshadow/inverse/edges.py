@@ -10,8 +10,6 @@ has its peak at the edge. The offset is the median of the parts' peaks: some are
 texture.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 MAX_EDGE_OFFSET = 3.0  # farthest from an outline that an edge is searched [pixels]

@@ -1,7 +1,5 @@
 """Fit files: TOML that says which scene explains which images, checked key by key (README.md lists the keys)."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ with the weights w of the targets' masks: a single adjoint gives it for all dire
 comes from, since no pixel loses by light.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -4,8 +4,6 @@ A fit that is interrupted goes on from its checkpoint. One that has ended with a
 that it writes, by which it is known and not done again. One that failed leaves none, and is tried again.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import dataclasses

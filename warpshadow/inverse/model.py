@@ -1,7 +1,5 @@
 """Models: the images of a problem, and their loss, as functions of the free parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

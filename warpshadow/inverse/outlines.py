@@ -1,7 +1,5 @@
 """Outlines: where bodies are seen in a target, painted by hand or by a segmentation, and not right to the pixel."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Pictures of a fit under way."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -1,7 +1,5 @@
 """Quasi-Newton steps with a trust region that grows and shrinks by the achieved decrease."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar

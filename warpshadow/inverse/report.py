@@ -1,7 +1,5 @@
 """Reports: the result of a fit as numbers, files and pictures."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math

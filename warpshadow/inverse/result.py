@@ -1,7 +1,5 @@
 """Results: the values that a fit found, and all that follows from them."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping

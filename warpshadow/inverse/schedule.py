@@ -1,7 +1,5 @@
 """Schedules: the stages of a fit, coarse to fine; the stages of an image are another thing, warpshadow.stages."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace

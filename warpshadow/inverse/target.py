@@ -1,7 +1,5 @@
 """Targets: the images that a fit explains."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple

@@ -10,8 +10,6 @@ A free light is linear, so it is projected out: from each column of J the best c
 count as measurements with their own standard deviations. J is of central differences of small images.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

@@ -13,8 +13,6 @@ that it is the projection of a light that is nowhere negative. Least squares wit
 equations; other losses by reweighting them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

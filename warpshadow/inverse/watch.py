@@ -4,8 +4,6 @@ All of it runs in the fit's own thread, between two iterations: pictures are mad
 often as a small part of its time allows, and only while a browser looks.
 """
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """The world that a fit renders: its scene, in which free parameters have put their own tensors."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace

@@ -11,8 +11,6 @@ ground, have no such gap; nor has an edge that a box stands on, or a body that s
 parallel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@ other pieces are cut, such as a thick wall with a window, segments of bent rods,
 outer layers of its thin walls.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Outlines: the edges around triangles of a plane and around their holes, and the convex polygons that they enclose."""
 
-from __future__ import annotations
-
 import numpy as np
 
 _STRAIGHT = 1e-5

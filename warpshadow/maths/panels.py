@@ -1,7 +1,5 @@
 """Panels: nearly flat, convex regions of a sheet, which is a mesh of one layer, such as cloth, or of a thin wall's."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Convex polygons into which triangles of a surface are joined."""
 
-from __future__ import annotations
-
 import heapq
 
 import numpy as np

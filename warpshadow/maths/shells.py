@@ -5,8 +5,6 @@ graph, in which neighbors should be on one side and opposites on two. The vector
 Laplacian tells the sides [Kunegis et al. 2010: spectral analysis of signed graphs].
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from warpshadow.maths.adjacency import area_normals, edge_neighbors

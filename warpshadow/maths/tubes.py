@@ -1,7 +1,5 @@
 """Tubes: rods that are bent, or closed to a ring, of quads around them; cut across, into straight segments."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 Spheres in a sheet bulge out of both sides. Where nobody sees one side, they may lie behind it, as deep as they like.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import NamedTuple
 

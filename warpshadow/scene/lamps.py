@@ -1,7 +1,5 @@
 """Small lamps: point and spot lights, whose shadows have edges as soft as the lamps are large."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

@@ -1,7 +1,5 @@
 """Scenes of one mesh: which of its axes is up, a ground, a sky and a camera that frames it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple

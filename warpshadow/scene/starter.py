@@ -1,7 +1,5 @@
 """A scene file to begin with, of a mesh as :func:`warpshadow.default_scene` shows it, to be edited by hand."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Near light from a box: the walls of a room, as bodies that emit the radiance of a map."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Adam for spheres: steps of centers, and of the logarithms of radii."""
 
-from __future__ import annotations
-
 import numpy as np
 
 RADIUS_RATE = 10.0  # step of the logarithm of a radius for a step of 1 of a center [1 / diagonals of the bounding box]

@@ -6,8 +6,6 @@ Both terms are volumes: of each sphere outside the mesh, and between the surface
 are balls of the medial axis, picked greedily; Adam does the rest.    [Lyu et al. 2021, section 3.2; Wang et al. 2006]
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

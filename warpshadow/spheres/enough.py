@@ -1,7 +1,5 @@
 """Number of spheres that a body needs, from short fits of a few counts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

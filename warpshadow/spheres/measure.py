@@ -1,7 +1,5 @@
 """Errors of the spheres that approximate a mesh."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 

@@ -1,7 +1,5 @@
 """The mesh in the frame of the fit: its bounding box has diagonal 1 and its center at the origin, y up."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A picture of spheres in their mesh."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from warpshadow import check

@@ -1,7 +1,5 @@
 """Receivers on and around a body, the light that they see past it by rays, and how errors of that count."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -10,8 +10,6 @@ All is found once, in the body's own frame and at rest; patches move with the bo
 backs follow those of its fronts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Time of a video, before it is rendered: with a renderer, which is set up first, or as stills."""
 
-from __future__ import annotations
-
 import warp as wp
 
 from warpshadow.device.parallel import thread_count

@@ -1,7 +1,5 @@
 """The viewer in a browser: viser's server, a page for each client, and the panel beside the picture."""
 
-from __future__ import annotations
-
 import contextlib
 import html
 import time

@@ -4,8 +4,6 @@ It knows nothing of fits. It shows the fit's messages, and stores the requests o
 a page that is slow or closed delays nothing.
 """
 
-from __future__ import annotations
-
 import html
 import threading
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Handles to drag a body by: at its middle, in units of a page."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,7 +1,5 @@
 """A drawing of how losses fall, as a page shows it: SVG, a color for each stage of a fit, a line for each descent."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

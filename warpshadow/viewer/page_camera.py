@@ -4,8 +4,6 @@ A page knows a world of its own, in which the scene is a few units large: its ne
 made for such scenes. So lengths that it says are divided by a factor.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Paint the view of a page: an image as a picture, and its depth."""
 
-from __future__ import annotations
-
 import functools
 import time
 from collections import OrderedDict

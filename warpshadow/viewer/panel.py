@@ -1,7 +1,5 @@
 """The panel beside the picture, and the handles in it. All pages share it."""
 
-from __future__ import annotations
-
 import dataclasses
 import threading
 from collections.abc import Callable

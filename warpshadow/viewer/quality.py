@@ -1,7 +1,5 @@
 """Quality of images: few pixels and cells while something moves, then more while it rests."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 MOVING_SECONDS = 1 / 24  # time budget of an image while something moves; encoding and sending come on top

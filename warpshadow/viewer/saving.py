@@ -1,7 +1,5 @@
 """A scene as it is shown, as a file to take home."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import tempfile

@@ -5,8 +5,6 @@ page asks for one. Here none of this is wanted. viser 1.1 has no setting for the
 uses its private attributes; tests/viewer/test_app.py notices if they change.
 """
 
-from __future__ import annotations
-
 import asyncio
 import concurrent.futures
 import contextlib

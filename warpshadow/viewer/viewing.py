@@ -1,7 +1,5 @@
 """Interface of viewers for Python and the command line; viser is imported at first use."""
 
-from __future__ import annotations
-
 import contextlib
 import html
 import threading

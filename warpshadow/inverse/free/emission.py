@@ -1,7 +1,5 @@
 """Free emission of a body: the radiance of a lamp."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar

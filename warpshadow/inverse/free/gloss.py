@@ -1,7 +1,5 @@
 """Free gloss of a body: how rough it is, and how much of it is metal."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A free lamp: the place of a body that emits."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar

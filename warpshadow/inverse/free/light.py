@@ -1,7 +1,5 @@
 """Free light."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass, replace
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Free reflectance of a body: its colors or its texture."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar

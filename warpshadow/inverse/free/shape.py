@@ -1,7 +1,5 @@
 """A free shape of a body: how it is deformed, and how large its spheres are."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import ClassVar
 

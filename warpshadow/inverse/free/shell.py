@@ -1,7 +1,5 @@
 """A free shell: how far away light is that comes from a sphere around the scene."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar

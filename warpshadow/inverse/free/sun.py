@@ -1,7 +1,5 @@
 """A free sun: where it is, how strong, and how large."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Free parameters of each view: its exposure, the offset of its outlines, and its camera."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar

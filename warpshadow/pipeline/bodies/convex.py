@@ -5,8 +5,6 @@ directions that each part covers is computed. The parts of solids block their ow
 cloth, in which its receivers do not lie, so sheets cast shadows on themselves found by rays.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import NamedTuple
 

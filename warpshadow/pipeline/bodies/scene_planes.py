@@ -4,8 +4,6 @@ Small spheres in a sheet would bulge out of it, and a large one that touches it 
 Instead, the share of a cell of directions that a plane covers is computed.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 Where the method of visibility has no cells, it is found here, past spheres.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

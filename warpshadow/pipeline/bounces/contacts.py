@@ -1,7 +1,5 @@
 """Contacts of a scene: where its bodies touch each other as the scene has them, so that patches are finer there."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 

@@ -4,8 +4,6 @@ A body's patches send to the body itself by form factors, a plane's by its grid,
 light of a cell is blocked, one of these takes its place.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import NamedTuple

@@ -14,8 +14,6 @@ Between patches of one body the first part is a small matrix that does not chang
 "all" after each of them.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -3,8 +3,6 @@
 The spheres are placed in each call, where the patches are (:mod:`warpshadow.stages.bounces.proxies`).
 """
 
-from __future__ import annotations
-
 import functools
 from typing import NamedTuple
 

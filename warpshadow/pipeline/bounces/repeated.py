@@ -1,7 +1,5 @@
 """How often light bounces between patches: a number of times, or until nothing is left of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Transmittance in lobes by the directional method: that of cells, which the shading of a view has found."""
 
-from __future__ import annotations
-
 import functools
 from typing import NamedTuple
 

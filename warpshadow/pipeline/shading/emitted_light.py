@@ -1,7 +1,5 @@
 """Light of emitters on receivers past the blockers between: direct light, and highlights in lobes."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterable, Iterator, Sequence
 

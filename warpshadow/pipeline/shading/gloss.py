@@ -6,8 +6,6 @@ prefiltered map, and its transmittance in the way of the method. Suns and emitte
 the end.
 """
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

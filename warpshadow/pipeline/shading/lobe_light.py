@@ -1,7 +1,5 @@
 """Light in the lobes of bodies that shine, and how a method of visibility blocks it: by default not at all."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import NamedTuple

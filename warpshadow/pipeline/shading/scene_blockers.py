@@ -1,7 +1,5 @@
 """The blockers of a scene: which bodies are planes, or convex parts, or have traced self-visibility, and the rest."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterable
 

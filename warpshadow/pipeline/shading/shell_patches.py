@@ -5,8 +5,6 @@ center. Transfer vectors are to these (:mod:`.stages.shell.shell_transfer`), and
 that is linear in light stays so. Visibility does not depend on the shell, so it is that of any light in cells.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shading with sphere blockers: the base of such methods, and the node of the receivers' visibility."""
 
-from __future__ import annotations
-
 import abc
 import functools
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Transfer vectors, and the light that they meet: the kinds of light that a call takes, and coefficients in a basis."""
 
-from __future__ import annotations
-
 from typing import TypeAlias
 
 import numpy as np

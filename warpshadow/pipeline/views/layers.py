@@ -1,7 +1,5 @@
 """Layers: further channels of an image beside color, for compositing and for data sets."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -11,8 +11,6 @@ beside others, in a texel of a plane or among the proxies that a receiver sees t
 Without f a pile of bodies that stick in each other was 19% off, and without v the ground around it 11% too dark.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -31,8 +31,6 @@ Light of planes in a garage is 2.6% off, without o 3.5%, by sides ordered by dis
 sunlit ground on the roof of a barn was 1.4 to 1.6 times too strong.
 """
 
-from __future__ import annotations
-
 import warp as wp
 
 from warpshadow.device.parallel import Scratch

@@ -16,8 +16,6 @@ In a room of albedo 0.8 with a window the energy is 0.3% off; by one term in pla
 albedo of 1 8% too low.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

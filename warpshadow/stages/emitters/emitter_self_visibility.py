@@ -11,8 +11,6 @@ that takes the samples y⁰_k at rest nearest to the placed ones, that of Σ_k y
 A convex body hides nothing that faces a receiver, and has no table.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Normals: smooth vertex normals, weighted by the area of faces."""
 
-from __future__ import annotations
-
 import warp as wp
 
 from warpshadow.device.array_checks import finite_arrays

@@ -1,7 +1,5 @@
 """Samples of light: directions drawn in proportion to the radiance of a map."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 

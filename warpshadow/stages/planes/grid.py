@@ -1,7 +1,5 @@
 """Grids: texels in the plane of a flat body, small near the other bodies, and the mesh's coverage of them."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

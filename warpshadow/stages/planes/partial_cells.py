@@ -11,8 +11,6 @@ h_k, and a weight c_s: max(n·ω_s, 0) for receivers in a plane, for others 1 ab
 A wall behind a window is 8.0, 4.5 and 2.6% off in 32, 64 and 128 cells, with C in place of C′ 15, 5.4 and 3.4%.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import warp as wp
 

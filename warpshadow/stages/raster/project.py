@@ -1,7 +1,5 @@
 """Projection: from the world to clip space, by cameras that may move."""
 
-from __future__ import annotations
-
 import numpy as np
 import warp as wp
 

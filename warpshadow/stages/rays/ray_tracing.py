@@ -1,7 +1,5 @@
 """The reference for the approximations: the mesh itself, by rays through its bounding volume hierarchy."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
