@@ -120,5 +120,4 @@ class FreeOfBody(Free):
         return body_name if names.count(body_name) == 1 else f"body_{self.number}"
 
     def numbered(self, scene: Scene) -> FreeOfBody:
-        """Replace the name of its body by the number."""
         return replace(self, body=scene.body_number(self.body))

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -34,22 +33,16 @@ class Lamp(FreeOfBody):
         body: The body, its number or name.
     """
 
-    key: ClassVar[str] = "lamp"
-    moves: ClassVar[bool] = True
-
-    @property
-    def shows_in_outlines(self) -> bool:
-        """A lamp is seen by its light alone."""
-        return False
+    key = "lamp"
+    shows_in_outlines = False
+    moves = True
 
     def check_scene(self, scene: Scene) -> None:
-        """Raise ValueError for a body that does not emit, and for one that is alone."""
         check_emits(scene, self.number)
         if all(body.is_emitter for body in scene.bodies):
             raise ValueError(f"body: got {self.number} in a scene of lamps alone, expected another body that it lights")
 
     def start(self, setting: Setting) -> Values:
-        """Where the scene has it."""
         return {"turn": setting.tensor(np.zeros(2)), "log_distance": setting.tensor(0.0)}
 
     def _middle(self, setting: Setting) -> np.ndarray:
@@ -99,16 +92,13 @@ class Lamp(FreeOfBody):
         return {"turn": setting.tensor(turn), "log_distance": values["log_distance"].detach().clone()}
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
-        """Move the lamp."""
         world.translations[self.number], world.scales[self.number] = self._placed(values, setting)
         world.moving.add(self.number)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        """Move the lamp."""
         translation, scale = (part.cpu().numpy() for part in self._placed(values, setting))
         fitted.change_body(self.number, translation=translation, scale=float(scale))
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        """Its place and scale."""
         body = fitted.scene.bodies[self.number]
         return {f"{self.called(fitted)}.{name}": getattr(body, name) for name in ("translation", "scale")}

@@ -2,7 +2,6 @@
 
 import functools
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -34,7 +33,8 @@ class Light(Free):
         smoothness: Weight of the mean square of differences between neighboring cells [targets' radiance].
     """
 
-    key: ClassVar[str] = "light"
+    key = "light"
+    is_light = True
 
     order: int | None = 5
     directions: int | None = None
@@ -55,16 +55,10 @@ class Light(Free):
             check.nonnegative(name, getattr(self, name))
 
     def check_scene(self, scene: Scene) -> None:
-        """Raise ValueError for spherical harmonics in place of light that has a radius."""
         if scene.shell is not None and self.order is not None:
             raise ValueError(
                 f"order: got {self.order} for light that has a radius, expected cells: Light(None, directions=512)"
             )
-
-    @property
-    def is_light(self) -> bool:
-        """Images are linear in it."""
-        return True
 
     @functools.cached_property
     def basis(self) -> Basis:
@@ -72,7 +66,6 @@ class Light(Free):
         return CellBasis(fibonacci(self.directions)) if self.order is None else HarmonicBasis(self.order)
 
     def start(self, setting: Setting) -> Values:
-        """The scene's light."""
         radiance = self.basis.coefficients(setting.scene.light) / setting.unit
         if isinstance(self.basis, CellBasis):
             return {"log_radiance": setting.tensor(np.log(np.maximum(radiance, _MIN_RADIANCE)))}
@@ -85,7 +78,6 @@ class Light(Free):
         return values["coefficients"] * (setting.unit * np.sqrt(4 * np.pi))
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
-        """Light the world with it."""
         world.light = self.coefficients(values, setting)
 
     def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -38,8 +37,8 @@ class Plane(FreeOfBody):
         carries: Further bodies that move with it, beside bodies that a free pose stands on it: numbers or names.
     """
 
-    key: ClassVar[str] = "plane"
-    moves: ClassVar[bool] = True
+    key = "plane"
+    moves = True
 
     height: float | None = None
     tilt: float | None = None
@@ -66,12 +65,10 @@ class Plane(FreeOfBody):
         object.__setattr__(self, "carries", tuple(self.carries))
 
     def numbered(self, scene: Scene) -> Plane:
-        """Replace names of bodies by their numbers."""
         carries = tuple(scene.body_number(body, "carries") for body in self.carries)
         return replace(self, body=scene.body_number(self.body), carries=carries)
 
     def check_scene(self, scene: Scene) -> None:
-        """Raise ValueError for a body that is not flat, or carries itself."""
         constraints.plane_below(scene.bodies[self.number], np.zeros(3), "body")
         if self.number in self.carries:
             raise ValueError(f"carries: got {self.number}, the plane itself; expected bodies that stand on it")
@@ -120,7 +117,6 @@ class Plane(FreeOfBody):
         return turn @ rotation, turn @ (point - pivot) + pivot + unit * values["height"] * setting.tensor(normal)
 
     def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
-        """Squared distances from the priors and of the points, in standard deviations."""
         normal, foot, unit = self._start(setting)
         squares = []
         if self.height is not None:
@@ -134,7 +130,6 @@ class Plane(FreeOfBody):
         return PRIOR * torch.stack(squares).sum() if squares else None
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
-        """Move it, and the bodies that it carries."""
         for number in self._moving():
             world.rotations[number], world.translations[number] = self.moved(
                 values, setting, world.rotations[number], world.translations[number]
@@ -142,7 +137,6 @@ class Plane(FreeOfBody):
             world.moving.add(number)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        """Move it, and the bodies that it carries."""
         for number in self._moving():
             body = fitted.scene.bodies[number]
             start = setting.tensor(body.rotation_matrix()), setting.tensor(body.translation)
@@ -150,7 +144,6 @@ class Plane(FreeOfBody):
             fitted.change_body(number, rotation=rotation, translation=translation)
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        """Its pose."""
         body = fitted.scene.bodies[self.number]
         return {f"{self.called(fitted)}.{name}": getattr(body, name) for name in ("rotation", "translation")}
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -57,8 +56,8 @@ class Pose(FreeOfBody):
             six standard deviations. Where a free plane moves it along, from there.
     """
 
-    key: ClassVar[str] = "pose"
-    moves: ClassVar[bool] = True
+    key = "pose"
+    moves = True
 
     rotation: str = "axis-angle"
     scale: bool = False
@@ -118,14 +117,12 @@ class Pose(FreeOfBody):
             raise ValueError("size: got a prior of a size that is not free, expected scale = true beside it")
 
     def numbered(self, scene: Scene) -> Pose:
-        """Replace names of bodies by their numbers."""
         numbered_pose = replace(self, body=scene.body_number(self.body))
         if self.stands_on is None:
             return numbered_pose
         return replace(numbered_pose, stands_on=scene.body_number(self.stands_on, "stands_on"))
 
     def check_scene(self, scene: Scene) -> None:
-        """Raise ValueError for a body that stands on itself, or on one that is not flat, or cannot move onto it."""
         if self.stands_on is None:
             return
         ground = scene.body_number(self.stands_on, "stands_on")
@@ -158,14 +155,12 @@ class Pose(FreeOfBody):
         return PoseConstraint(turns, shifts, rotation, plane, onto, constraints.hull_points(body.mesh))
 
     def start(self, setting: Setting) -> Values:
-        """Pose of the body."""
         possible = self.constraint(setting)
         turn = np.zeros(len(possible.turns)) if self.rotation == "axis-angle" else _NO_TURN[self.rotation]
         values = {"turn": setting.tensor(turn), "shift": setting.tensor(np.zeros(len(possible.shifts)))}
         return values | ({"log_scale": setting.tensor(0.0)} if self.scale else {})
 
     def scattered(self, values: Values, number: int, generator: torch.Generator) -> Values:
-        """The pose, turned."""
         from scipy.spatial.transform import Rotation
 
         copies = super().scattered(values, number, generator)
@@ -208,7 +203,6 @@ class Pose(FreeOfBody):
         return setting.scene.bodies[self.number].to_world(setting.middle(self.number))
 
     def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
-        """Squared distances from the priors, in standard deviations."""
         body = setting.scene.bodies[self.number]
         rotation, center, scale = self.moved(values, setting)
         squares = []
@@ -231,7 +225,6 @@ class Pose(FreeOfBody):
         return PRIOR * torch.stack(squares).sum() if squares else None
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
-        """Move the body."""
         rotation, translation, scale = self._posed(values, setting)
         world.rotations[self.number] = rotation
         world.translations[self.number] = translation
@@ -239,12 +232,10 @@ class Pose(FreeOfBody):
         world.moving.add(self.number)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        """Move the body."""
         rotation, translation, scale = (part.cpu().numpy() for part in self._posed(values, setting))
         fitted.change_body(self.number, rotation=rotation, translation=translation, scale=float(scale))
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        """The pose."""
         body = fitted.scene.bodies[self.number]
         names = ("rotation", "translation", "scale") if self.scale else ("rotation", "translation")
         return {f"{self.called(fitted)}.{name}": getattr(body, name) for name in names}

@@ -35,17 +35,6 @@ def checked_size(size: Any) -> tuple[int, int]:
     return size[0], size[1]
 
 
-def check_texture_settings(free: Any) -> None:
-    """Check ``size`` and ``smoothness`` of a parameter of numbers or colors, beside ``per_vertex``."""
-    check.nonnegative("smoothness", free.smoothness)
-    if free.size is not None:
-        object.__setattr__(free, "size", checked_size(free.size))
-    if free.per_vertex and free.size is not None:
-        raise ValueError(f"per_vertex: got it beside size={free.size}, expected one of them")
-    if free.smoothness and free.size is None:
-        raise ValueError("smoothness: got it without size, expected size, too, as of a texture")
-
-
 def check_uvs(number: int, scene: Scene) -> None:
     """Raise ValueError for a body that cannot have a texture."""
     if scene.bodies[number].mesh.uvs is None:
@@ -66,6 +55,69 @@ def variation(texels: torch.Tensor) -> torch.Tensor:
     return (squares[0] + squares[1]) / texels.numel()
 
 
+@dataclass(frozen=True)
+class FreeOfSurface(FreeOfBody):
+    """Numbers or colors of a body's surface, from where the scene has them: one, or one for each vertex, or a texture.
+
+    Args:
+        body: The body, its number or name.
+        per_vertex: One for each vertex.
+        size: Height and width of a texture [texels], which needs uvs; None for no texture. Texels that no view sees
+            stay as they start.
+        smoothness: Weight of the mean square of differences between neighboring texels.
+    """
+
+    value_key: ClassVar[str] = "value"
+
+    per_vertex: bool = False
+    size: tuple[int, int] | None = None
+    smoothness: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check.flag("per_vertex", self.per_vertex)
+        check.nonnegative("smoothness", self.smoothness)
+        if self.size is not None:
+            object.__setattr__(self, "size", checked_size(self.size))
+        if self.per_vertex and self.size is not None:
+            raise ValueError(f"per_vertex: got it beside size={self.size}, expected one of them")
+        if self.smoothness and self.size is None:
+            raise ValueError("smoothness: got it without size, expected size, too, as of a texture")
+
+    @property
+    def is_one(self) -> bool:
+        """Whether one value is free, for the whole body."""
+        return not self.per_vertex and self.size is None
+
+    def check_scene(self, scene: Scene) -> None:
+        if self.size is not None:
+            check_uvs(self.number, scene)
+        elif self.per_vertex and self.rows(scene.bodies[self.number]).ndim == 3:
+            raise ValueError(f"per_vertex: got it of a body whose {self.key} is a texture, expected size")
+
+    def rows(self, body: Body) -> np.ndarray:
+        """The body's values, [1, channel] or [vertex, channel], or [height, width, channel]."""
+        raise NotImplementedError
+
+    def _unit(self, setting: Setting) -> float:
+        """Body's value that counts as 1."""
+        return 1.0
+
+    def start(self, setting: Setting) -> Values:
+        """The body's values; their mean, where one is free."""
+        body = setting.scene.bodies[self.number]
+        rows = self.rows(body) / self._unit(setting)
+        if self.per_vertex:
+            return {self.value_key: setting.tensor(np.broadcast_to(rows, (body.mesh.vertex_count, rows.shape[1])))}
+        mean = setting.tensor(rows.reshape(-1, rows.shape[-1]).mean(axis=0)[None])
+        if self.size is None:
+            return {self.value_key: mean}
+        return {self.value_key: resized(setting.tensor(rows) if rows.ndim == 3 else mean[None], self.size)}
+
+    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
+        return self.smoothness * variation(values[self.value_key]) if self.smoothness else None
+
+
 @check.frozen()
 @dataclass(frozen=True)
 class Albedo(FreeOfBody):
@@ -76,7 +128,7 @@ class Albedo(FreeOfBody):
         per_vertex: A color for each vertex.
     """
 
-    key: ClassVar[str] = "albedo"
+    key = "albedo"
 
     per_vertex: bool = False
 
@@ -85,7 +137,6 @@ class Albedo(FreeOfBody):
         check.flag("per_vertex", self.per_vertex)
 
     def check_scene(self, scene: Scene) -> None:
-        """Raise ValueError for a body whose reflectance is of another kind."""
         if scene.bodies[self.number].texture is not None:
             raise ValueError(f"body: got {self.number}, which has a texture; expected one without, or Texture")
 
@@ -97,20 +148,16 @@ class Albedo(FreeOfBody):
         return {"color": setting.tensor(_one_color(body)[None])}
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
-        """Color the body."""
         world.albedo[self.number] = values["color"]
 
     def project(self, values: Values) -> None:
-        """Reflectances are in [0, 1]."""
         values["color"].clamp_(0, 1)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        """Color the body."""
         color = values["color"].cpu().numpy()
         fitted.change_body(self.number, albedo=color if self.per_vertex else color[0])
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        """The color, of a body that has one."""
         body = fitted.scene.bodies[self.number]
         return {} if self.per_vertex else {f"{self.called(fitted)}.albedo": body.albedo}
 
@@ -131,7 +178,7 @@ class Texture(FreeOfBody):
         colors: Number of these colors.
     """
 
-    key: ClassVar[str] = "texture"
+    key = "texture"
 
     size: tuple[int, int] | None = None
     smoothness: float = 0.0
@@ -148,7 +195,6 @@ class Texture(FreeOfBody):
         check.integer("colors", self.colors, minimum=2)
 
     def check_scene(self, scene: Scene) -> None:
-        """Raise ValueError for a body that cannot have a texture."""
         check_uvs(self.number, scene)
 
     def start(self, setting: Setting) -> Values:
@@ -169,11 +215,9 @@ class Texture(FreeOfBody):
         return ranked_colors[(shares * len(flat)).long()]
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
-        """Cover the body."""
         world.textures[self.number] = values["texels"]
 
     def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
-        """Penalty of unlikely textures."""
         texels = values["texels"]
         energies = []
         if self.smoothness:
@@ -188,7 +232,6 @@ class Texture(FreeOfBody):
         return torch.stack(energies).sum() if energies else None
 
     def project(self, values: Values) -> None:
-        """Reflectances are in [0, 1]."""
         for colors in values.values():
             colors.clamp_(0, 1)
 

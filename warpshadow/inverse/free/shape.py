@@ -1,7 +1,6 @@
 """A free shape of a body: how it is deformed, and how large its spheres are."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -44,8 +43,8 @@ class Deformation(FreeOfBody):
         count: Nodes that carry a vertex.
     """
 
-    key: ClassVar[str] = "deformation"
-    moves: ClassVar[bool] = True
+    key = "deformation"
+    moves = True
 
     rigidity: float = 1.25
     firmness: float = 0.001
@@ -59,13 +58,11 @@ class Deformation(FreeOfBody):
         check.integer("count", self.count, unit="nodes")
 
     def check_scene(self, scene: Scene) -> None:
-        """Raise ValueError for a body with too few spheres."""
         nodes = _sphere_count(scene.bodies[self.number])
         if self.count >= nodes:
             raise ValueError(f"count: got {self.count} for {nodes} nodes, the body's spheres, expected fewer than them")
 
     def start(self, setting: Setting) -> Values:
-        """The shape as it is."""
         nodes = setting.graph(self.number, self.count).node_positions.shape[0]
         sizes = {"turns": 3, "shifts": 3, "stretches": 6}
         return {key: setting.tensor(np.zeros((nodes, size))) for key, size in sizes.items()}
@@ -86,7 +83,6 @@ class Deformation(FreeOfBody):
         return points, apply(graph.centers, shifts[None], dtypes=(wp.vec3,))
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
-        """Bend the body."""
         points, centers = self._deformed(values, setting)
         has_spheres = len(setting.spheres(self.number)) > 0  # without shadows there are nodes, but no spheres
         world.rest = world.renderer.deformed(self.number, points, centers if has_spheres else None, rest=world.rest)
@@ -101,7 +97,6 @@ class Deformation(FreeOfBody):
         return self.rigidity * gaps + self.firmness * stretches.square().sum((1, 2)).mean()
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        """Bend the body, mesh and spheres."""
         points, centers = (part[0].cpu().numpy() for part in self._deformed(values, setting))
         mesh = replace(fitted.scene.bodies[self.number].mesh, positions=points)
         fitted.change_body(self.number, mesh=mesh, self_shadows="spheres")  # as in the images of the fit
@@ -120,8 +115,8 @@ class Radii(FreeOfBody):
         persistence: Weight of the mean square of the factors' logarithms.
     """
 
-    key: ClassVar[str] = "radii"
-    moves: ClassVar[bool] = True
+    key = "radii"
+    moves = True
 
     persistence: float = 0.0
 
@@ -130,26 +125,21 @@ class Radii(FreeOfBody):
         check.nonnegative("persistence", self.persistence)
 
     def check_scene(self, scene: Scene) -> None:
-        """Raise ValueError for a body without spheres."""
         if scene.visibility.method not in SPHERE_METHODS or not _sphere_count(scene.bodies[self.number]):
             raise ValueError(f"body: got {self.number}, which has no spheres; expected one that casts a shadow")
 
     def start(self, setting: Setting) -> Values:
-        """The radii as they are."""
         return {"log": setting.tensor(np.zeros(len(setting.spheres(self.number))))}
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
-        """Swell and shrink the spheres."""
         radii = setting.tensor(setting.spheres(self.number).radii) * values["log"].exp()
         world.rest = world.renderer.deformed(self.number, radii=radii, rest=world.rest)
         world.moving.add(self.number)
 
     def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
-        """Logarithms of the factors."""
         return self.persistence * values["log"].square().mean() if self.persistence else None
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        """Swell and shrink the spheres."""
         spheres = fitted.spheres(self.number)
         radii = spheres.radii * values["log"].exp().cpu().numpy()
         fitted.change_body(self.number, blockers=Spheres(spheres.centers, radii), self_shadows="spheres")

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -28,16 +27,11 @@ class Shell(Free):
     :class:`.Light`, in cells.
     """
 
-    key: ClassVar[str] = "shell"
-    moves: ClassVar[bool] = True  # rays, which lights alone may have, have no gradient to it
-
-    @property
-    def shows_in_outlines(self) -> bool:
-        """A shell is seen by its light alone."""
-        return False
+    key = "shell"
+    shows_in_outlines = False
+    moves = True  # rays, which lights alone may have, have no gradient to it
 
     def check_scene(self, scene: Scene) -> None:
-        """Raise ValueError for light that is infinitely far away."""
         if scene.shell is None:
             raise ValueError(
                 "shell: got it for a scene whose light is infinitely far away, expected light of a radius: "
@@ -45,7 +39,6 @@ class Shell(Free):
             )
 
     def start(self, setting: Setting) -> Values:
-        """The scene's radius."""
         return {"log_gap": setting.tensor(0.0)}
 
     def _start(self, setting: Setting) -> tuple[np.ndarray, float, float]:
@@ -68,16 +61,13 @@ class Shell(Free):
         return torch.cat([setting.tensor(center), radius.reshape(1)])
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
-        """Light the world from there."""
         world.shell = self.shell(values, setting)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        """Give the scene's light the radius."""
         assert isinstance(fitted.scene.light, EnvironmentMap)
         light = replace(fitted.scene.light, radius=float(self.shell(values, setting)[3]))
         fitted.scene = replace(fitted.scene, light=light)
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        """The radius."""
         assert fitted.scene.shell is not None
         return {"light.radius": fitted.scene.shell[3]}

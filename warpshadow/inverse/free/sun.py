@@ -3,7 +3,6 @@
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -49,7 +48,7 @@ class Sun(Free):
         directions: Number of cells.
     """
 
-    key: ClassVar[str] = "sun"
+    key = "sun"
 
     direction: ArrayLike
     irradiance: ArrayLike
@@ -69,7 +68,6 @@ class Sun(Free):
         vars(self).update(direction=tuple(direction.tolist()), irradiance=tuple(strength.tolist()))
 
     def check_scene(self, scene: Scene) -> None:
-        """Raise ValueError for light that no sun can be added to."""
         if not isinstance(scene.light, EnvironmentMap):
             raise ValueError(
                 "sun: got it for light in spherical harmonics, expected a map, to which it is added: "
@@ -134,14 +132,12 @@ class Sun(Free):
         return light.to(values["turn"])
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
-        """Light the world with it, beside the map."""
         of_map = setting.cached(
             (self.name, "map"), lambda: setting.tensor(self.basis.coefficients(setting.scene.light))
         )
         world.light = of_map + self.coefficients(values, setting)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        """Add it to the map."""
         direction, strength, radius = (part.cpu().numpy() for part in self._sun(values, setting))
         degrees = float(np.degrees(radius))
         if degrees < _UNRESOLVED * self.resolution:
@@ -152,7 +148,6 @@ class Sun(Free):
         fitted.sun = {"direction": direction, "irradiance": strength, "angular_radius": degrees}
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        """Its direction, irradiance and angular radius."""
         return {f"sun.{name}": value for name, value in fitted.sun.items()}
 
 

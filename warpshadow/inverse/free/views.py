@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -24,7 +23,7 @@ class Exposure(Free):
         white_balance: Whether the gains of red and blue are free, too; that of green is 1.
     """
 
-    key: ClassVar[str] = "exposure"
+    key = "exposure"
 
     white_balance: bool = False
 
@@ -32,7 +31,6 @@ class Exposure(Free):
         check.flag("white_balance", self.white_balance)
 
     def start(self, setting: Setting) -> Values:
-        """Factors of 1."""
         views = len(setting.cameras)
         values = {"log": setting.tensor(np.zeros(views))}
         return values | ({"log_white": setting.tensor(np.zeros((views, 2)))} if self.white_balance else {})
@@ -45,17 +43,14 @@ class Exposure(Free):
         return torch.stack([red, torch.ones_like(red), blue], dim=1)
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
-        """Expose the world's images."""
         world.exposures = values["log"].exp()[:, None] * self._gains(values)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        """Factors of the views."""
         fitted.exposures = values["log"].exp().tolist()
         if self.white_balance:
             fitted.white_balances = [tuple(gains) for gains in self._gains(values).tolist()]
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        """A factor of each view, and its gains."""
         figures: dict[str, ArrayLike] = {"exposure": fitted.exposures}
         return figures | ({"white_balance": fitted.white_balances} if self.white_balance else {})
 
@@ -69,20 +64,15 @@ class OutlineOffset(Free):
         deviation: Standard deviation of its prior [pixels].
     """
 
-    key: ClassVar[str] = "outline_offset"
+    key = "outline_offset"
+    shows_in_outlines = True
 
     deviation: float = 1.0
 
     def __post_init__(self) -> None:
         check.positive("deviation", self.deviation)
 
-    @property
-    def shows_in_outlines(self) -> bool:
-        """Outlines alone have an offset."""
-        return True
-
     def start(self, setting: Setting) -> Values:
-        """Offsets of 0."""
         return {"offset": setting.tensor(np.zeros(len(setting.cameras)))}
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
@@ -90,15 +80,12 @@ class OutlineOffset(Free):
         world.outline_offsets = values["offset"] * self.deviation
 
     def regularizer(self, values: Values, setting: Setting) -> torch.Tensor:
-        """Squared offsets in standard deviations."""
         return PRIOR * values["offset"].square().sum()
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        """Offsets of the views."""
         fitted.outline_offsets = (values["offset"] * self.deviation).tolist()
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        """An offset of each view."""
         return {"outline_offset": fitted.outline_offsets}
 
 
@@ -111,8 +98,8 @@ class CameraPose(Free):
         focal: Whether the focal length is free, too.
     """
 
-    key: ClassVar[str] = "camera"
-    moves: ClassVar[bool] = True
+    key = "camera"
+    moves = True
 
     focal: bool = False
 
@@ -120,7 +107,6 @@ class CameraPose(Free):
         check.flag("focal", self.focal)
 
     def start(self, setting: Setting) -> Values:
-        """The cameras as they are."""
         views = len(setting.cameras)
         values = {"turn": setting.tensor(np.zeros((views, 3))), "shift": setting.tensor(np.zeros((views, 3)))}
         return values | ({"log_focal": setting.tensor(np.zeros(views))} if self.focal else {})
@@ -140,12 +126,10 @@ class CameraPose(Free):
         return rotations, -(rotations @ moved_eyes[..., None])[..., 0], intrinsics
 
     def apply(self, values: Values, setting: Setting, world: World) -> None:
-        """Move the cameras."""
         rotations, translations, intrinsics = self._posed(values, setting, world.cameras)
         world.clip_matrices = world.renderer.clip_matrices(rotations, translations, intrinsics)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        """Move the cameras."""
         rotations, translations, intrinsics = (
             part.cpu().numpy().astype(np.float64) for part in self._posed(values, setting, setting.cameras)
         )
