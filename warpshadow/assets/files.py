@@ -46,7 +46,6 @@ def locked(path: Path, *, timeout: float = -1, busy: Exception | None = None) ->
     """Lock a file against others that want to hold it, in this process or another; the lock ends with the process.
 
     Args:
-        path: The file.
         timeout: How long another's lock is waited for [s]; by default as long as it takes.
         busy: The error to raise after that.
     """

@@ -18,12 +18,9 @@ class HarmonicLight:
     """Light as coefficients in spherical harmonics, which answers as an :class:`EnvironmentMap` does.
 
     Two of the same coefficients are equal.
-
-    Args:
-        coefficients: Linear RGB of any order, [order², 3]; it holds a copy.
     """
 
-    coefficients: np.ndarray
+    coefficients: np.ndarray  # linear RGB of any order, [order², 3]; it holds a copy
 
     def __post_init__(self) -> None:
         sh.order_of("light", self.coefficients)

@@ -120,8 +120,6 @@ def load_material(path: MeshSource) -> tuple[Mesh, Material]:
     the green and the blue of a texture, which are linear, likewise if all faces have the same; else its means count.
     They emit by their emissive factor and strength, times a texture, likewise.
 
-    Args:
-        path: As there.
     Warns:
         As there; of a texture that cannot be read, or that counts in place of colors; and of textures of roughness or
         emission of which the means count.

@@ -15,7 +15,6 @@ def read_radiance(path: Path, check_size: Callable[[int, int], None]) -> np.ndar
     By hand: OpenImageIO (an 8 MB wheel) leaves the exposure in and fails at old-style runs; imageio needs OpenCV.
 
     Args:
-        path: The file.
         check_size: Raises for a width and height that are too large, before any pixel is read.
     Returns:
         Linear RGB with row 0 at the top and the exposure divided out, float32 [height, width, 3].

@@ -16,7 +16,6 @@ def read_raw(path: Path, check_size: Callable[[int, int], None]) -> np.ndarray:
     The white balance is the camera's, or that of daylight where the file has none.
 
     Args:
-        path: The file.
         check_size: Raises ValueError for a width and height that are too large.
     Returns:
         RGB, 1 where the sensor saturates, float32 of shape [height, width, 3].

@@ -34,17 +34,11 @@ class Coding(Protocol):
 
 @dataclass(frozen=True)
 class Even:
-    """Numbers at even steps.
+    """Numbers at even steps."""
 
-    Args:
-        bits: Of a code, 8 or 16.
-        low: The value of code 0; lower, where an image goes lower.
-        high: The value of the largest code; higher, where an image goes higher.
-    """
-
-    bits: int = 8
-    low: float = 0.0
-    high: float = 1.0
+    bits: int = 8  # of a code, 8 or 16
+    low: float = 0.0  # the value of code 0; lower, where an image goes lower
+    high: float = 1.0  # the value of the largest code; higher, where an image goes higher
 
     def codes(self, values: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
         """Encode channels; see :class:`Coding`."""

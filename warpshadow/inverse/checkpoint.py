@@ -63,8 +63,6 @@ def save(path: AnyPath, state: Mapping[str, object]) -> None:
 def load(path: AnyPath) -> dict[str, Any] | None:
     """Read the last whole state.
 
-    Args:
-        path: The file that :func:`save` was given.
     Returns:
         The state, its tensors on the CPU; that of FILE.previous, with a warning, where the file is damaged, and without
         one where it is missing because a process ended between two renames; None where there is neither.

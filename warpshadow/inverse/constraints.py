@@ -30,36 +30,22 @@ _AZIMUTHS = np.arange(24) * (np.pi / 12)  # directions in which it is tilted
 
 @dataclass(frozen=True, eq=False)
 class PlaneConstraint:
-    """A plane that a body touches from above: points with normal · p = offset.
+    """A plane that a body touches from above: points with normal · p = offset."""
 
-    Args:
-        normal: Unit vector away from the plane's solid side, shape [3].
-        offset: Distance from the origin along the normal [scene units].
-    """
-
-    normal: np.ndarray
-    offset: float
+    normal: np.ndarray  # unit vector away from the plane's solid side, shape [3]
+    offset: float  # distance from the origin along the normal [scene units]
 
 
 @dataclass(frozen=True, eq=False)
 class PoseConstraint:
-    """The poses that remain possible.
+    """The poses that remain possible."""
 
-    Args:
-        turns: Orthonormal basis of possible axis-angle vectors, rows, shape [0 to 3, 3].
-        shifts: The same of the shifts of the body's middle, [0 to 3, 3].
-        rotation: From which the body turns, shape [3, 3].
-        plane: That the body touches, if any.
-        onto: Shift of the middle that moves the body by a unit along the plane's normal, and no fixed coordinate, [3].
-        hull: Vertices of the mesh's convex hull, of which one is the lowest, [vertex, 3]; for a plane.
-    """
-
-    turns: np.ndarray
-    shifts: np.ndarray
-    rotation: np.ndarray
-    plane: PlaneConstraint | None = None
-    onto: np.ndarray | None = None
-    hull: np.ndarray | None = None
+    turns: np.ndarray  # orthonormal basis of possible axis-angle vectors, rows, [0 to 3, 3]
+    shifts: np.ndarray  # the same of the shifts of the body's middle, [0 to 3, 3]
+    rotation: np.ndarray  # from which the body turns, shape [3, 3]
+    plane: PlaneConstraint | None = None  # that the body touches, if any
+    onto: np.ndarray | None = None  # shift by a unit along the normal, and no fixed coordinate, [3]
+    hull: np.ndarray | None = None  # vertices of the mesh's convex hull, [vertex, 3]; for a plane
 
     def turn(self, values: torch.Tensor) -> torch.Tensor:
         """The axis-angle vector of coordinates among the possible ones. Differentiable: values."""

@@ -90,14 +90,7 @@ def gain_of_last(losses: Sequence[float]) -> float:
 def warn_of(
     problem: Problem, setting: Setting, values: Mapping[str, Values], stage: Stage, losses: Sequence[float], end: str
 ) -> None:
-    """Warn of reasons to doubt a result.
-
-    Args:
-        problem, setting, values: Of the result.
-        stage: The last one.
-        losses: Of the last descent.
-        end: Why it ended.
-    """
+    """Warn of reasons to doubt a result."""
     is_exposure_known = problem.basis is None and not problem.free_of(Exposure)
     has_coverage = problem.targets[0].image.shape[2] == 4
     model = Model(problem, setting, small_stage(problem))

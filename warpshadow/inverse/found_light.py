@@ -84,14 +84,7 @@ class FoundLight:
 def found_light(
     light: EnvironmentMap | np.ndarray, problem: Problem, setting: Setting, values: Mapping[str, Values]
 ) -> FoundLight:
-    """The light of a fit, and which part of it the images determine.
-
-    Args:
-        light: The light that was found.
-        problem: In which light is free.
-        setting: Of the problem.
-        values: Free parameters by name.
-    """
+    """The light of a fit, and which part of it the images determine."""
     radiance = as_light(light).radiance
     pixel_directions = equirectangular_directions(len(radiance))
     cells = CellBasis(fibonacci(_CELLS)).functions(pixel_directions.reshape(-1, 3))

@@ -21,12 +21,7 @@ _SEEN_VERTICES = 0.5  # the part of all vertices that an image sees, about
 
 
 class Model:
-    """Images of a problem at a stage's size, and their loss against the targets.
-
-    Args:
-        setting: Of the problem.
-        stage: Sets size and softness.
-    """
+    """Images of a problem at a stage's size, and their loss against the targets."""
 
     def __init__(self, problem: Problem, setting: Setting, stage: Stage):
         self.problem, self.setting, self.regularization = problem, setting, stage.regularization

@@ -13,18 +13,12 @@ from warpshadow.scene.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """The outlines of all targets at the size of a stage.
+    """The outlines of all targets at the size of a stage."""
 
-    Args:
-        views, bodies: Of each outline, [outline].
-        distances: Signed distance from the outline [pixels of the targets], positive inside, [outline, height, width].
-        scale: Pixels of the stage in one of the targets.
-    """
-
-    views: tuple[int, ...]
+    views: tuple[int, ...]  # of each outline, [outline]
     bodies: tuple[int, ...]
-    distances: torch.Tensor
-    scale: float
+    distances: torch.Tensor  # signed [pixels of the targets], positive inside, [outline, height, width]
+    scale: float  # pixels of the stage in one of the targets
 
     def differences(self, masks: torch.Tensor, offsets: torch.Tensor | None) -> torch.Tensor:
         """Masks of bodies minus their outlines, [outline, height, width].

@@ -192,18 +192,11 @@ def _saturation_share(saturation: float) -> np.ndarray:
 
 
 class Stacked(NamedTuple):
-    """Targets of all views at the size of a stage.
+    """Targets of all views at the size of a stage."""
 
-    Attributes:
-        images: [view, height, width, channel].
-        weights: [view, height, width].
-        saturated: Where a part of a pixel is, so that all of it is at least as bright, [view, height, width, 3]; None
-            if nowhere.
-    """
-
-    images: torch.Tensor
-    weights: torch.Tensor
-    saturated: torch.Tensor | None
+    images: torch.Tensor  # [view, height, width, channel]
+    weights: torch.Tensor  # [view, height, width]
+    saturated: torch.Tensor | None  # where a part of a pixel is, [view, height, width, 3]; None if nowhere
 
 
 def stack_targets(targets: Sequence[Target], scale: float, device: torch.device) -> Stacked:

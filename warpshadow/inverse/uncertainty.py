@@ -284,12 +284,7 @@ def _by_tiles(pixels: np.ndarray) -> np.ndarray:
 def uncertainty(
     problem: Problem, setting: Setting, values: Mapping[str, Values], fitted: FittedScene
 ) -> Uncertainty | None:
-    """Find the uncertainty of a fit's few parameters; None without any.
-
-    Args:
-        problem, setting, values: Of the result.
-        fitted: The scene that was found.
-    """
+    """Find the uncertainty of a fit's few parameters; None without any."""
     if not _few_number_entries(problem, values):
         return None
     normal = NormalMatrix(problem, setting, values)

@@ -40,11 +40,7 @@ class Watched(Protocol):
 
 
 class Watch:
-    """Show a fit on a page, and obey the page's buttons.
-
-    Args:
-        viewer: Has the page.
-    """
+    """Show a fit on a page, and obey the page's buttons."""
 
     def __init__(self, viewer: FitViewer):
         self._page = viewer.page
@@ -52,11 +48,7 @@ class Watch:
         self._has_failed = False
 
     def update(self, fit: Watched, save: Callable[[], None]) -> bool:
-        """Show how far a fit is, wait while it is to pause, and say whether it goes on.
-
-        Args:
-            save: Writes a checkpoint.
-        """
+        """Show how far a fit is, wait while it is to pause, and say whether it goes on."""
         page = self._page
         if page.pauses:
             save()
@@ -124,12 +116,7 @@ def pictures(fit: Watched) -> np.ndarray:
 
 @contextlib.contextmanager
 def watching(view: bool | FitViewer, *, progress: bool) -> Iterator[Watch | None]:
-    """Watch a fit if that is asked for; a page that was made here is closed at the end.
-
-    Args:
-        view: Whether to open a page, or the one to show the fit on.
-        progress: Say where the page is.
-    """
+    """Watch a fit if that is asked for; a page that was made here is closed at the end."""
     if isinstance(view, FitViewer):
         yield Watch(view)
         return

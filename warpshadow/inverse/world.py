@@ -101,9 +101,6 @@ class Setting:
 class World:
     """A scene on its way to an image; each free parameter replaces the scene's values with its tensors.
 
-    Args:
-        renderer: Of the scene, at a stage's size and softness, with a camera for each view.
-        cameras: The same.
     Attributes:
         light, albedo, textures: As :class:`warpshadow.torch.TorchRenderer` takes them.
         gloss: Its roughness and the like, by name.
@@ -169,23 +166,14 @@ class World:
 
 @dataclass
 class FittedScene:
-    """The fitted scene, and the fitted values that are not in the scene, such as exposures.
+    """The fitted scene, and the fitted values that are not in the scene, such as exposures."""
 
-    Args:
-        scene: The scene; its camera is that of the first view.
-        cameras: Of the views.
-        exposures: Factors of the views' colors.
-        white_balances: Gains of red, green and blue in each view, beside its exposure; green has 1.
-        outline_offsets: Of the views' painted outlines [pixels].
-        sun: Direction, irradiance and angular radius [degrees] of a free sun, which the scene's light has.
-    """
-
-    scene: Scene
-    cameras: list[Camera]
-    exposures: list[float]
-    white_balances: list[tuple[float, float, float]] = field(default_factory=list)
-    outline_offsets: list[float] = field(default_factory=list)
-    sun: dict[str, ArrayLike] = field(default_factory=dict)
+    scene: Scene  # the scene; its camera is that of the first view
+    cameras: list[Camera]  # of the views
+    exposures: list[float]  # factors of the views' colors
+    white_balances: list[tuple[float, float, float]] = field(default_factory=list)  # gains; green has 1
+    outline_offsets: list[float] = field(default_factory=list)  # of the views' painted outlines [pixels]
+    sun: dict[str, ArrayLike] = field(default_factory=dict)  # of a free sun, which the scene's light has
 
     def spheres(self, body: int) -> Spheres:
         """Spheres of a body in its own space."""

@@ -131,9 +131,6 @@ def find_solids(scene: Scene, parts: Mapping[int, Sequence[ConvexPart]]) -> froz
     """Find the bodies whose convex parts block their own light, too: those that consist of solids alone.
 
     Panels are chords of bent sheets, in which receivers do not lie; and rays to a sun may be asked for.
-
-    Args:
-        parts: The :func:`blocking_parts` of the scene.
     """
     visibility = scene.visibility.with_method()
     return frozenset(

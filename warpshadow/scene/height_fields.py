@@ -49,10 +49,6 @@ class Land(NamedTuple):
 def solid_behind(body: Body, others: tuple[Body, ...]) -> Land | None:
     """Close a body that is land behind.
 
-    Args:
-        body: The body.
-        others: The other bodies.
-
     Returns:
         The solid. None where it is no land: its mesh is closed or flat, faces look to both sides of any plane or lie
         above each other; others stand on both sides, as of a tent, or on none; or the side on which they stand does not

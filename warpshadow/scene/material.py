@@ -36,17 +36,11 @@ GLOSS_DEFAULTS = {field.name: field.default for field in MATERIAL_FIELDS}
 
 
 class BodyInput(NamedTuple):
-    """An input of images that bodies have each, as an array or a tensor.
+    """An input of images that bodies have each, as an array or a tensor."""
 
-    Args:
-        is_color: Whether its items are linear RGB; else they are numbers.
-        has_rows: Whether it may be one item, or one for each vertex.
-        has_images: Whether it may be an image, [height, width].
-    """
-
-    is_color: bool = True
-    has_rows: bool = True
-    has_images: bool = False
+    is_color: bool = True  # whether its items are linear RGB; else they are numbers
+    has_rows: bool = True  # whether it may be one item, or one for each vertex
+    has_images: bool = False  # whether it may be an image, [height, width]
 
     def is_image(self, shape: tuple[int, ...], vertex_count: int) -> bool:
         """Whether a value of a shape, with a batch or without, is an image, for a mesh of so many vertices."""

@@ -129,9 +129,6 @@ class Bodies(tuple[Body, ...]):
     def number(self, body: BodyLike, argument: str = "body") -> int:
         """Number of a body, from 0, given that or its name.
 
-        Args:
-            body: The number or the name.
-            argument: Its name in messages.
         Raises:
             ValueError: for a body that there is not, and for a name that two bodies have from their meshes.
         """

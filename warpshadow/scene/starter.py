@@ -52,14 +52,6 @@ def write_starter(
 ) -> None:
     """Write the default scene of a mesh; its file names the mesh's, and is short.
 
-    Args:
-        path: The scene file.
-        mesh: File of the mesh.
-        scene: Its :func:`warpshadow.default_scene`.
-        albedo: Reflectance of the mesh, if not that of its file.
-        light: File of the environment map that lights it, if not the sky.
-        direction: From the mesh's middle to the camera.
-        rotation: Angle by which the light is turned [degrees about +y].
     Raises:
         FileExistsError: where the file is there, and differs: it may have been edited.
     """

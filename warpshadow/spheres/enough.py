@@ -36,7 +36,6 @@ def enough_spheres(
     where it falls no longer and the shadow is whole.
 
     Args:
-        mesh, receivers, seed: The mesh to fit, its receivers, and the seed of random choices.
         cached_errors: Errors of the first short fits, where an interrupted call found them.
         store_errors: Gets the known fits, after each short fit.
     """

@@ -288,7 +288,6 @@ def _descend(
     """Fit one sphere or more; yields them after every step.
 
     Args:
-        mesh, fit_key, count: The mesh, its key, and the number of spheres.
         cached_arrays: Arrays that an interrupted call left.
         store_part: Gets how far it is in words, and arrays from which a later call goes on.
     """

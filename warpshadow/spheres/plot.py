@@ -17,10 +17,6 @@ def check_matplotlib() -> None:
 def plot_spheres(mesh: Mesh, spheres: Spheres, path: AnyPath) -> None:
     """Draw the spheres inside the translucent mesh, from two sides.
 
-    Args:
-        mesh: The mesh, y up.
-        spheres: Spheres in the mesh's coordinates.
-        path: Image file to write; the format follows its suffix.
     Raises:
         ImportError: when matplotlib, the extra ``plot``, is not installed.
     """

@@ -53,9 +53,6 @@ class FitReceivers:
     """Receivers on a body, around it and in its cavities, and on grounds below it.
 
     Args:
-        mesh: The body.
-        count: How many.
-        rng: Draws them.
         sharpness: Weight of errors under a sun relative to errors under each wider light.
 
     A receiver sees 128 directions of a hemisphere. Receivers on a mesh look along its normals, to both sides of an open

@@ -35,8 +35,6 @@ _MAX_KINDS = 8  # captured at a time: each holds the memory of its call
 class Replays:
     """The captured calls of a renderer.
 
-    Args:
-        is_on: Whether calls are captured at all.
     Attributes:
         reason: Why the last call was plain; empty if it was replayed.
     """
@@ -118,8 +116,6 @@ class _Kind:
 class Capture:
     """A call as graphs: one forward, and one backward if a tensor requires a gradient.
 
-    Args:
-        call: The call, whose tensors are copied.
     Raises:
         RuntimeError: where the function cannot be captured.
         MemoryError: likewise.

@@ -73,8 +73,6 @@ def median_times(
     Each is called twice and timed the second time: the first pays for compilation and cold memory.
 
     Args:
-        functions: Functions without arguments.
-        runs: Timed calls of each.
         clock: Clock [s]; on one thread, ``time.process_time`` leaves out other processes of a busy machine.
     """
     times: list[list[float]] = [[] for _ in functions]

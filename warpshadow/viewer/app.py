@@ -36,8 +36,6 @@ class ViewerApp:
     """A scene in the browser, until it is closed.
 
     Args:
-        scene: The scene; "auto" is replaced by a choice.
-        host, port: As of a :class:`.Server`.
         path: The scene's file, which is saved with the changes in it; None where it has none.
     Attributes:
         painter: Paints pictures.

@@ -21,8 +21,6 @@ _WIDTH = 760  # of the pictures' panel [CSS pixels]
 class FitPage:
     """A page that shows a fit, until it is closed; all browsers share it.
 
-    Args:
-        host, port: As of a :class:`.Server`.
     Attributes:
         url: Where it is.
     """
@@ -79,14 +77,7 @@ class FitPage:
     # ------------------------------------------------------------------------------------------ display
 
     def show(self, note: str, losses: Sequence[Sequence[Sequence[float]]], stage: int, candidates: int) -> None:
-        """Show how far a fit is.
-
-        Args:
-            note: In words.
-            losses: Of the iterations of each descent of each stage.
-            stage: The present one.
-            candidates: How many descents it has.
-        """
+        """Show how far a fit is, by the losses of the iterations of each descent of each stage."""
         self._note.content = _note_html(html.escape(note))
         self._plot.content = _note_html(loss_plot(losses))
         color = COLORS[stage % len(COLORS)]

@@ -44,10 +44,6 @@ class Paint(Protocol):
 class Loop:
     """Paints for any number of pages.
 
-    Args:
-        paint: Paints a picture.
-        viewer_state: Initial viewer state.
-        rest: So long after the last request all rests [s].
     Attributes:
         viewer_state: The viewer state.
         depth: Whether pages are sent how far away everything is.
@@ -93,8 +89,6 @@ class Loop:
     def change(self, **changes: Any) -> ViewerState:
         """Show something else to all pages.
 
-        Args:
-            changes: Fields of :class:`ViewerState`.
         Raises:
             ValueError: for an invalid state; then nothing changes.
         """

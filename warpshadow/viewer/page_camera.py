@@ -22,21 +22,15 @@ _NARROWEST, _WIDEST = 0.5, 170.0  # field of view [degrees]
 class PageCamera:
     """A pinhole camera with square pixels that looks through the middle of a canvas.
 
-    Args:
-        wxyz: Camera to world as a quaternion (x right, y down, z forward), any length but 0.
-        position: Of the eye [page units].
-        fov_y: Vertical field of view [degrees].
-        width: Of the canvas [pixels].
-        height: Of the canvas [pixels].
     Raises:
         ValueError: for numbers that are not finite, or larger than any page is.
     """
 
-    wxyz: tuple[float, ...]
-    position: tuple[float, ...]
-    fov_y: float
-    width: int
-    height: int
+    wxyz: tuple[float, ...]  # camera to world as a quaternion (x right, y down, z forward), any length but 0
+    position: tuple[float, ...]  # of the eye [page units]
+    fov_y: float  # vertical field of view [degrees]
+    width: int  # of the canvas [pixels]
+    height: int  # of the canvas [pixels]
 
     def __post_init__(self) -> None:
         """Check it."""

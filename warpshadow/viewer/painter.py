@@ -43,31 +43,19 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A message to a page.
+    """A message to a page."""
 
-    Args:
-        rgb: The picture, sRGB, uint8 of shape [height, width, 3].
-        depth: Distance along the view [page units], float32 of shape [row, column], which may be fewer; None where
-            it was not requested.
-        quality: The quality it was made with.
-        seconds: How long it took.
-        cells: Its cells, in words.
-        error: Relative L2 error of the bodies' pixels against rays; None where it was not requested.
-    """
-
-    rgb: np.ndarray
-    depth: np.ndarray | None
-    quality: Quality
-    seconds: float
-    cells: str
-    error: float | None = None
+    rgb: np.ndarray  # the picture, sRGB, uint8 of shape [height, width, 3]
+    depth: np.ndarray | None  # distance along the view [page units], [row, column], maybe fewer; None if unasked
+    quality: Quality  # the quality it was made with
+    seconds: float  # how long it took
+    cells: str  # its cells, in words
+    error: float | None = None  # relative L2 error of the bodies' pixels against rays; None if unasked
 
 
 class Painter:
     """Render a scene for pages; values that several pictures share are computed once.
 
-    Args:
-        scene: The scene; a method "auto" has been replaced.
     Attributes:
         page_scale: Units of a page in a unit of the scene.
         coarse_light: The scene's light, as it is used while something moves.
@@ -88,13 +76,7 @@ class Painter:
         self.coarse_light = scene.known_light.coarsened(_COARSE_MAP).as_argument
 
     def paint(self, viewer_state: ViewerState, page: PageCamera, quality: Quality, *, depth: bool = False) -> Frame:
-        """Paint the image of a page.
-
-        Args:
-            viewer_state: The viewer state.
-            page: From where.
-            depth: Whether distances are asked for, too.
-        """
+        """Paint the image of a page."""
         start = time.perf_counter()
         renderer, view, camera, image = self._drawn(viewer_state, page, quality)
         error = None
@@ -219,11 +201,7 @@ class Painter:
 
 
 class RecentCache(Generic[Value]):
-    """The last values, by key.
-
-    Args:
-        count: How many are cached.
-    """
+    """The last values, by key."""
 
     def __init__(self, count: int):
         self._count = count
@@ -280,9 +258,6 @@ def relative_error(image: np.ndarray, reference: np.ndarray) -> float | None:
 def error_picture(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Difference of an image from the reference, a fifth of its mean as full red (too bright) or blue (too dark).
 
-    Args:
-        image: Linear RGB and coverage, shape [height, width, 4].
-        reference: Likewise.
     Returns:
         uint8 of shape [height, width, 3].
     """
@@ -299,8 +274,6 @@ def error_picture(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
 def distances(renderer: Renderer, view: View) -> np.ndarray:
     """Distance along the view of the surface at the middle sample of each pixel, Inf where there is nothing.
 
-    Args:
-        renderer: Made the view.
     Returns:
         Scene units, shape [height, width].
     """

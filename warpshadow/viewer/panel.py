@@ -28,14 +28,7 @@ _MAP_COLUMNS = 256
 
 
 class Panel:
-    """Controls that change a scene.
-
-    Args:
-        server: Shows it.
-        loop: Is told of changes.
-        painter: Knows the scene.
-        path: The scene's file; None where it has none.
-    """
+    """Controls that change a scene."""
 
     def __init__(self, server: viser.ViserServer, loop: Loop, painter: Painter, path: Path | None = None):
         self._server, self._loop, self._painter, self._path = server, loop, painter, path

@@ -12,21 +12,13 @@ _STEP = 1.3  # of pixels, that is worth another image
 
 @dataclass(frozen=True)
 class Quality:
-    """Cost of an image.
+    """Cost of an image."""
 
-    Args:
-        pixels: Of the image, about.
-        cells: At most so many direction cells, or directions of rays that all pixels share.
-        rays: At most so many of a pixel.
-        supersampling: At most so many samples across a pixel.
-        is_moving: Whether it is made while something moves.
-    """
-
-    pixels: int
-    cells: int
-    rays: int
-    supersampling: int
-    is_moving: bool
+    pixels: int  # of the image, about
+    cells: int  # at most so many direction cells, or directions of rays that all pixels share
+    rays: int  # at most so many of a pixel
+    supersampling: int  # at most so many samples across a pixel
+    is_moving: bool  # whether it is made while something moves
 
 
 class FrameRate:
@@ -50,8 +42,6 @@ class FrameRate:
         """The next quality while all rests.
 
         Args:
-            last: That of the last image.
-            seconds: Its time.
             canvas: Pixels that the page has.
         Returns:
             None where no better one can be seen, or would take too long.

@@ -23,14 +23,7 @@ def saved_camera(scene: Scene, page: PageCamera, page_scale: float) -> Camera:
 
 
 def as_toml(path: Path, scene: Scene, viewer_state: ViewerState, camera: Camera) -> bytes:
-    """A scene file with the changes in it; it names the same files as before.
-
-    Args:
-        path: The file as it was.
-        scene: The scene in it.
-        viewer_state: How it is shown.
-        camera: From where.
-    """
+    """A scene file with the changes in it; it names the same files as before."""
     tables = toml_tables.read(path, "scene file")
     tables["camera"] = camera_table(camera) | {"supersampling": scene.supersampling}
     light = tables["light"]

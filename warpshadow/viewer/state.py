@@ -32,15 +32,10 @@ PICTURE, ERROR = "picture", "error against rays"
 
 @dataclass(frozen=True)
 class BodyPose:
-    """Pose of a body: a rotation, then a translation.
+    """Pose of a body: a rotation, then a translation."""
 
-    Args:
-        rotation: Axis-angle vector [degrees].
-        translation: Offset [scene units].
-    """
-
-    rotation: tuple[float, ...]
-    translation: tuple[float, ...]
+    rotation: tuple[float, ...]  # axis-angle vector [degrees]
+    translation: tuple[float, ...]  # offset [scene units]
 
     def __post_init__(self) -> None:
         """Check it."""
@@ -82,39 +77,22 @@ class BodyGloss:
 
 @dataclass(frozen=True)
 class ViewerState:
-    """Viewer state.
+    """Viewer state."""
 
-    Args:
-        turn: Of the light about +y [degrees].
-        scale: Of the light.
-        stops: Exposure of the picture.
-        method: Of visibility.
-        sampling: Of "ray-traced".
-        directions: Cells of "directional".
-        softness: κ of "directional".
-        spheres: For each body that casts shadows, how many; None as the scene has them.
-        receivers: Of all bodies, or :data:`AS_GIVEN`.
-        bounces: Of light; methods that find none leave them out.
-        shows: :data:`PICTURE` or :data:`ERROR`.
-        shows_light: Whether the light itself is behind the bodies.
-        poses: Of the bodies.
-        gloss: Of the bodies.
-    """
-
-    turn: float
-    scale: float
-    stops: float
-    method: str
-    sampling: str
-    directions: int
-    softness: float
-    spheres: int | None
-    receivers: str
-    bounces: Bounces
-    shows: str
-    shows_light: bool
-    poses: tuple[BodyPose, ...]
-    gloss: tuple[BodyGloss, ...]
+    turn: float  # of the light about +y [degrees]
+    scale: float  # of the light
+    stops: float  # exposure of the picture
+    method: str  # of visibility
+    sampling: str  # of "ray-traced"
+    directions: int  # cells of "directional"
+    softness: float  # κ of "directional"
+    spheres: int | None  # for each body that casts shadows, how many; None as the scene has them
+    receivers: str  # of all bodies, or AS_GIVEN
+    bounces: Bounces  # of light; methods that find none leave them out
+    shows: str  # PICTURE or ERROR
+    shows_light: bool  # whether the light itself is behind the bodies
+    poses: tuple[BodyPose, ...]  # of the bodies
+    gloss: tuple[BodyGloss, ...]  # of the bodies
 
     def __post_init__(self) -> None:
         """Check it."""
