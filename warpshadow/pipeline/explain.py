@@ -21,19 +21,12 @@ class Decision:
 
 @dataclass(frozen=True)
 class StageReport:
-    """A stage of a call; it is true if it runs.
+    """A stage of a call; it is true if it runs."""
 
-    Args:
-        name: Name of the stage.
-        forward: Whether it is computed.
-        backward: Whether its adjoint is, when gradients are played back.
-        items: On how many items, in words.
-    """
-
-    name: str
-    forward: Decision
-    backward: Decision
-    items: str
+    name: str  # name of the stage
+    forward: Decision  # whether it is computed
+    backward: Decision  # whether its adjoint is, when gradients are played back
+    items: str  # on how many items, in words
 
     def __bool__(self) -> bool:
         return self.forward.runs

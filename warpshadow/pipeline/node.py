@@ -112,21 +112,14 @@ class NodeStage(NamedTuple):
     A named node is one row. Further rows are steps that its function times itself, and steps that it makes needless,
     which are idle.
 
-    Args:
-        name: Its name.
-        items: On how many items it is computed, in words.
-        idle: Why there is nothing to do, in words.
-        has_adjoint: Whether gradients take it more than to hand them on.
-        inputs: Its inputs, where they are fewer than its node's.
-
     Items and idle may be functions that make the words.
     """
 
-    name: str
-    items: str | Callable[[], str] = ""
-    idle: str | Callable[[], str] = ""
-    has_adjoint: bool = True
-    inputs: "tuple[AnyInput, ...]" = ()
+    name: str  # its name
+    items: str | Callable[[], str] = ""  # on how many items it is computed, in words
+    idle: str | Callable[[], str] = ""  # why there is nothing to do, in words
+    has_adjoint: bool = True  # whether gradients take it more than to hand them on
+    inputs: "tuple[AnyInput, ...]" = ()  # its inputs, where they are fewer than its node's
 
 
 class Node:

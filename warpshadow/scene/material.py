@@ -9,20 +9,13 @@ from typing import NamedTuple
 
 
 class MaterialField(NamedTuple):
-    """A number of a surface: of a body, of each vertex, or a texture [height, width].
+    """A number of a surface: of a body, of each vertex, or a texture [height, width]."""
 
-    Args:
-        name: Of the field of a body, of the key of a scene file, and of the argument of a renderer.
-        default: Of a body that does not say. A roughness makes a body shine; others need a number in arrays of all.
-        minimum, maximum: The range that is accepted.
-        is_in_files: Whether materials of meshes' files have it, as glTF's do.
-    """
-
-    name: str
-    default: float
-    minimum: float = 0.0
+    name: str  # of the field of a body, of the key of a scene file, and of the argument of a renderer
+    default: float  # of a body that does not say. A roughness makes a body shine; others need a number in arrays of all
+    minimum: float = 0.0  # the range that is accepted
     maximum: float = 1.0
-    is_in_files: bool = False
+    is_in_files: bool = False  # whether materials of meshes' files have it, as glTF's do
 
 
 MATERIAL_FIELDS = (

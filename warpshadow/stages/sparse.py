@@ -31,17 +31,11 @@ class Entries(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SparseMatrix:
-    """A sparse matrix in compressed rows (CSR), and its transpose for the adjoint, which needs no sums across threads.
+    """A sparse matrix in compressed rows (CSR), and its transpose for the adjoint, so without sums across threads."""
 
-    Args:
-        shape: Number of rows and columns.
-        rows: Its entries by rows.
-        columns: The rows of its transpose.
-    """
-
-    shape: tuple[int, int]
-    rows: Entries
-    columns: Entries
+    shape: tuple[int, int]  # number of rows and columns
+    rows: Entries  # its entries by rows
+    columns: Entries  # the rows of its transpose
 
     @property
     def is_zero(self) -> bool:

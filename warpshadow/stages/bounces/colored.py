@@ -22,15 +22,10 @@ _COEFFICIENT_COST, _ROW_COST = 1.0, 8.0  # nanoseconds that a coefficient of a r
 
 @dataclass(frozen=True, eq=False)
 class ColoredTransfer:
-    """Transfer of each color, and its transpose for the adjoint, which so needs no sums across threads.
+    """Transfer of each color, and its transpose for the adjoint, which so needs no sums across threads."""
 
-    Args:
-        rows: vec3 of shape [receiver, coefficient].
-        columns: vec3 of shape [coefficient, receiver].
-    """
-
-    rows: wp.array
-    columns: wp.array
+    rows: wp.array  # vec3 of shape [receiver, coefficient]
+    columns: wp.array  # vec3 of shape [coefficient, receiver]
 
     @staticmethod
     def from_lit_receivers(lit_receivers: np.ndarray, *, device: wp.DeviceLike) -> ColoredTransfer:

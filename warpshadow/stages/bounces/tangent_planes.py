@@ -33,15 +33,10 @@ _MIN_WIDTH = 0.05  # least w, in radii
 
 
 class TangentPlanes(NamedTuple):
-    """Tangent planes of proxies.
+    """Tangent planes of proxies."""
 
-    Args:
-        equations: n, and the height of p above the proxy's center [scene units], vec4 of shape [batch, proxy].
-        tolerances: sin σ and r/w, vec2 of shape [proxy].
-    """
-
-    equations: wp.array
-    tolerances: wp.array
+    equations: wp.array  # n, and the height of p above the proxy's center [scene units], vec4 of shape [batch, proxy]
+    tolerances: wp.array  # sin σ and r/w, vec2 of shape [proxy]
 
 
 def find_tolerances(patches: "Sequence[Patches]", starts: np.ndarray, patch_indices: np.ndarray) -> np.ndarray:

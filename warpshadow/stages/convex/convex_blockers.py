@@ -51,19 +51,12 @@ class ConvexArrays:
 
 @dataclass(frozen=True, eq=False)
 class ConvexBlockers:
-    """The bodies of a scene that consist of convex parts.
+    """The bodies of a scene that consist of convex parts."""
 
-    Args:
-        body_count: Number of bodies.
-        edge_count: Edges of a part at most.
-        arrays: Their parts.
-        corners_of_vertices: Matrix that finds corners, [corner, vertex].
-    """
-
-    body_count: int
-    edge_count: int
-    arrays: ConvexArrays
-    corners_of_vertices: SparseMatrix
+    body_count: int  # number of bodies
+    edge_count: int  # edges of a part at most
+    arrays: ConvexArrays  # their parts
+    corners_of_vertices: SparseMatrix  # matrix that finds corners, [corner, vertex]
 
     @staticmethod
     def from_bodies(bodies: Sequence[ConvexBody], vertex_count: int, *, device: wp.DeviceLike) -> ConvexBlockers:

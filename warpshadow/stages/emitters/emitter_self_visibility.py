@@ -42,17 +42,11 @@ wp.set_module_options({"max_unroll": 1})
 
 
 class EmitterSelfVisibility(NamedTuple):
-    """Self-visibility of the samples of one emitter.
+    """Self-visibility of the samples of one emitter."""
 
-    Args:
-        rest_points: Samples at rest around their middle y⁰, of squares that sum up to 1; vec3 of shape [sample].
-        far_transmittance: s, float32 of shape [sample, cell].
-        distances: D [lengths of rest_points], float32 of shape [sample, cell].
-    """
-
-    rest_points: wp.array
-    far_transmittance: wp.array
-    distances: wp.array
+    rest_points: wp.array  # samples at rest around their middle y⁰, of squares that sum up to 1; vec3 of shape [sample]
+    far_transmittance: wp.array  # s, float32 of shape [sample, cell]
+    distances: wp.array  # D [lengths of rest_points], float32 of shape [sample, cell]
 
 
 @wp.kernel(enable_backward=False)

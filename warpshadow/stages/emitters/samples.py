@@ -178,17 +178,11 @@ EVERYWHERE = (3.0, 4.0)
 
 
 class EmitterBeams(NamedTuple):
-    """Beams of emitters (:mod:`.beams`), some of which may have none.
+    """Beams of emitters (:mod:`.beams`), some of which may have none."""
 
-    Args:
-        beams: Of the emitters, EVERYWHERE for none, shape [emitter, 2].
-        vertices: Weights of all vertices in the emitters' axes, [emitter, vertex].
-        faces: Weights of the emitting faces' area vectors in them, [emitter, face].
-    """
-
-    beams: np.ndarray
-    vertices: SparseMatrix
-    faces: SparseMatrix
+    beams: np.ndarray  # of the emitters, EVERYWHERE for none, shape [emitter, 2]
+    vertices: SparseMatrix  # weights of all vertices in the emitters' axes, [emitter, vertex]
+    faces: SparseMatrix  # weights of the emitting faces' area vectors in them, [emitter, face]
 
 
 class EmitterSpan(NamedTuple):
@@ -207,19 +201,12 @@ class EmitterSpan(NamedTuple):
 
 
 class SamplePieces(NamedTuple):
-    """Triangles that samples are made of.
+    """Triangles that samples are made of."""
 
-    Args:
-        corners: Weights of all vertices in their corners, [3 · piece, vertex].
-        first: Where those of each sample begin, and the end of the last, int32 of shape [sample + 1].
-        elongations: Square of half a sample's diagonal over its area, float32 of shape [sample].
-        softness: w of each, float32 of shape [sample].
-    """
-
-    corners: SparseMatrix
-    first: wp.array
-    elongations: wp.array
-    softness: wp.array
+    corners: SparseMatrix  # weights of all vertices in their corners, [3 · piece, vertex]
+    first: wp.array  # where those of each sample begin, and the end of the last, int32 of shape [sample + 1]
+    elongations: wp.array  # square of half a sample's diagonal over its area, float32 of shape [sample]
+    softness: wp.array  # w of each, float32 of shape [sample]
 
     @classmethod
     def of_emitters(cls, weights: Sequence[SampleWeights], corners: SparseMatrix) -> SamplePieces:
@@ -235,29 +222,17 @@ class SamplePieces(NamedTuple):
 
 
 class EmitterSamples(NamedTuple):
-    """Samples of all emitters of a scene.
+    """Samples of all emitters of a scene."""
 
-    Args:
-        vertices: Weights of all vertices in the samples' middles, [sample, vertex].
-        face_weights: Weights of the emitting faces in the samples' area vectors, [sample, face].
-        pieces: Pieces of each sample.
-        surface_points: Points of the samples, on ``faces``.
-        faces: Emitting faces, vec3i of shape [face].
-        bodies: The emitters, by number.
-        is_two_sided: Whether each is open.
-        first: Where the samples of each begin, and the end of the last, shape [emitter + 1].
-        beams: Of the emitters; None where none has one.
-    """
-
-    vertices: SparseMatrix
-    face_weights: SparseMatrix
-    pieces: SamplePieces
-    surface_points: SurfacePoints
-    faces: wp.array
-    bodies: tuple[int, ...]
-    is_two_sided: tuple[bool, ...]
-    first: np.ndarray
-    beams: EmitterBeams | None = None
+    vertices: SparseMatrix  # weights of all vertices in the samples' middles, [sample, vertex]
+    face_weights: SparseMatrix  # weights of the emitting faces in the samples' area vectors, [sample, face]
+    pieces: SamplePieces  # pieces of each sample
+    surface_points: SurfacePoints  # points of the samples, on ``faces``
+    faces: wp.array  # emitting faces, vec3i of shape [face]
+    bodies: tuple[int, ...]  # the emitters, by number
+    is_two_sided: tuple[bool, ...]  # whether each is open
+    first: np.ndarray  # where the samples of each begin, and the end of the last, shape [emitter + 1]
+    beams: EmitterBeams | None = None  # of the emitters; None where none has one
 
     def spans(self) -> Iterator[EmitterSpan]:
         """The samples of each emitter."""

@@ -91,19 +91,12 @@ def _grow_radii(
 
 @dataclass(frozen=True)
 class SphereBinding:
-    """Spheres bound to the vertices around them.
+    """Spheres bound to the vertices around them."""
 
-    Args:
-        item_starts: Where the items of each sphere begin, and the end of the last, int32 of shape [sphere + 1].
-        vertices: Of each item, int32 of shape [item].
-        weights: w, by which centers follow, float32 of shape [item].
-        shares: a, whose sum is 1 for each sphere, float32 of shape [item].
-    """
-
-    item_starts: wp.array
-    vertices: wp.array
-    weights: wp.array
-    shares: wp.array
+    item_starts: wp.array  # where the items of each sphere begin, and the end of the last, int32 of shape [sphere + 1]
+    vertices: wp.array  # of each item, int32 of shape [item]
+    weights: wp.array  # w, by which centers follow, float32 of shape [item]
+    shares: wp.array  # a, whose sum is 1 for each sphere, float32 of shape [item]
 
     @staticmethod
     def bind(

@@ -58,31 +58,18 @@ _STEP_U, _STEP_V = wp.uint32(3242174889), wp.uint32(2447445414)
 
 
 class PathSurfaces(NamedTuple):
-    """Surfaces that light bounces from, one instance.
+    """Surfaces that light bounces from, one instance."""
 
-    Args:
-        mesh: All bodies.
-        blocker_mesh: Mesh that blocks direct light, None for none.
-        faces: Vertex indices of the mesh, vec3i of shape [face].
-        normals: Unit normals of the vertices, vec3 of shape [vertex].
-        vertex_albedo: Reflectance of the vertices, vec3 of shape [vertex].
-        textures: Textures, of one instance; None where no body has one.
-        texture_of_face: Texture of each face, -1 for none, int32 of shape [face].
-        uvs: Texture coordinates, vec2 of shape [uv].
-        uv_faces: Indices of uvs, vec3i of shape [face].
-        emitters: Faces that emit; None without any.
-    """
-
-    mesh: wp.Mesh
-    blocker_mesh: wp.Mesh | None
-    faces: wp.array
-    normals: wp.array
-    vertex_albedo: wp.array
-    textures: Textures | None
-    texture_of_face: wp.array
-    uvs: wp.array
-    uv_faces: wp.array
-    emitters: EmittingFaces | None = None
+    mesh: wp.Mesh  # all bodies
+    blocker_mesh: wp.Mesh | None  # mesh that blocks direct light, None for none
+    faces: wp.array  # vertex indices of the mesh, vec3i of shape [face]
+    normals: wp.array  # unit normals of the vertices, vec3 of shape [vertex]
+    vertex_albedo: wp.array  # reflectance of the vertices, vec3 of shape [vertex]
+    textures: Textures | None  # textures, of one instance; None where no body has one
+    texture_of_face: wp.array  # texture of each face, -1 for none, int32 of shape [face]
+    uvs: wp.array  # texture coordinates, vec2 of shape [uv]
+    uv_faces: wp.array  # indices of uvs, vec3i of shape [face]
+    emitters: EmittingFaces | None = None  # faces that emit; None without any
 
 
 @wp.struct

@@ -81,17 +81,11 @@ def find_resampling_kernels(
 
 
 class ResamplingWeights(NamedTuple):
-    """Resampling weights of each cell of directions under a rotation.
+    """Resampling weights of each cell of directions under a rotation."""
 
-    Args:
-        counts: Number of lookups, int32 of shape [batch, direction].
-        indices: Rays or coarse cells, int32 of shape [batch, direction, lookup].
-        weights: Their weights, float32 of shape [batch, direction, lookup]; 0 after the last.
-    """
-
-    counts: wp.array
-    indices: wp.array
-    weights: wp.array
+    counts: wp.array  # number of lookups, int32 of shape [batch, direction]
+    indices: wp.array  # rays or coarse cells, int32 of shape [batch, direction, lookup]
+    weights: wp.array  # their weights, float32 of shape [batch, direction, lookup]; 0 after the last
 
 
 @wp.func

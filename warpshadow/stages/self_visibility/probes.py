@@ -255,21 +255,14 @@ def _find_sample_weights(
 
 
 class ProbeTable(NamedTuple):
-    """Arrays by which receivers of a body find their probes.
+    """Arrays by which receivers of a body find their probes."""
 
-    Args:
-        first_vertex, vertex_count: Of the body's vertices among all, and how many all are.
-        first_face, face_count: Likewise of its faces.
-        probe_count: Number of its probes; their backs follow.
-        pieces: As in :class:`VisibilityProbes`, vec4i.
-    """
-
-    first_vertex: int
+    first_vertex: int  # of the body's vertices among all, and how many all are
     vertex_count: int
-    first_face: int
+    first_face: int  # likewise of its faces
     face_count: int
-    probe_count: int
-    pieces: wp.array
+    probe_count: int  # number of its probes; their backs follow
+    pieces: wp.array  # as in VisibilityProbes, vec4i
 
     def of_vertices(self, vertices: wp.array) -> ProbeWeights:
         """Weights of vertices and their backs, int32 of shape [receiver], indices among all vertices: batch 1."""

@@ -55,15 +55,10 @@ def find_sun_cells(power: np.ndarray, draw: Callable[[np.ndarray, int], np.ndarr
 
 
 class RayProbes(NamedTuple):
-    """Points at which rays of a body start.
+    """Points at which rays of a body start."""
 
-    Args:
-        tree: Its faces, in its own frame.
-        points, normals: Of its probes, and then of their backs, vec3 of shape [row].
-    """
-
-    tree: FaceTree
-    points: wp.array
+    tree: FaceTree  # its faces, in its own frame
+    points: wp.array  # of its probes, and then of their backs, vec3 of shape [row]
     normals: wp.array
 
 

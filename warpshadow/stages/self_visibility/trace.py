@@ -48,15 +48,10 @@ def trace_seconds(row_count: int, face_count: int) -> float:
 
 
 class VisibilityRows(NamedTuple):
-    """Self-visibility of the probes, and then of their backs.
+    """Self-visibility of the probes, and then of their backs."""
 
-    Args:
-        bits: Whether rays escape, ray r is bit r % 32 of word r / 32: uint32 of shape [row, ray / 32].
-        cells: Shares of coarse cells that are open, in 255ths: uint8 of shape [row, ray / 8].
-    """
-
-    bits: wp.array
-    cells: wp.array
+    bits: wp.array  # whether rays escape, ray r is bit r % 32 of word r / 32: uint32 of shape [row, ray / 32]
+    cells: wp.array  # shares of coarse cells that are open, in 255ths: uint8 of shape [row, ray / 8]
 
     @property
     def ray_count(self) -> int:

@@ -37,17 +37,11 @@ _RECEIVER_COST, _CELL_COST = 40.0, 5.0  # nanoseconds that the cells of a receiv
 
 
 class SharpCells(NamedTuple):
-    """Sharp cells.
+    """Sharp cells."""
 
-    Args:
-        directions: Unit vectors to where their light comes from, some repeated: [16, 3].
-        slots: Index of each cell among them, −1 for cells that are not sharp: [direction].
-        scale: Radius of the cells that their edges go by, in radii of one of 16 cells.
-    """
-
-    directions: np.ndarray
-    slots: np.ndarray
-    scale: float
+    directions: np.ndarray  # unit vectors to where their light comes from, some repeated: [16, 3]
+    slots: np.ndarray  # index of each cell among them, −1 for cells that are not sharp: [direction]
+    scale: float  # radius of the cells that their edges go by, in radii of one of 16 cells
 
 
 def find_sharp_cells(
