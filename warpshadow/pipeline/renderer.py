@@ -202,7 +202,7 @@ class SceneRenderer:
     def _scene_view(self) -> View:
         """Build the view of the cameras on the scene; a warning tells of coarse faces."""
         view = self.view()
-        if not self._method.every_sample_receives:
+        if not self.scene.visibility.traits.every_sample_receives:
             warn_of_vertex_receivers(view, self._given_scene.bodies, self.cameras[0])
         return view
 

@@ -48,7 +48,7 @@ class Bouncing(enum.Enum):
 
 
 def choose_bouncing(
-    *, is_free: bool, is_given: bool, is_of_scene: bool, spheres_stand_in: bool, shares_directions: bool
+    *, is_free: bool, is_given: bool, is_of_scene: bool, has_spheres: bool, shares_directions: bool
 ) -> Bouncing:
     """Choose how light bounces: the lower rows of the table above.
 
@@ -56,9 +56,9 @@ def choose_bouncing(
         is_free: Whether the light is free.
         is_given: Whether some reflectance is given in place of the scene's.
         is_of_scene: Whether bodies and the only camera are where the scene has them, for good, and no shell moves.
-        spheres_stand_in, shares_directions: Of the method.
+        has_spheres, shares_directions: Of the method.
     """
-    if spheres_stand_in:
+    if has_spheres:
         return Bouncing.STATIC if is_of_scene and (is_free or is_given) else Bouncing.MOVING
     return Bouncing.STATIC if is_free or is_given or shares_directions else Bouncing.PATHS
 
@@ -105,7 +105,7 @@ class LightTransport:
             is_free=light.is_free,
             is_given=materials is not points.materials,
             is_of_scene=points.is_scene_view and not shell_moves,
-            spheres_stand_in=self.method.spheres_stand_in,
+            has_spheres=self.method.visibility.traits.has_spheres,
             shares_directions=self.method.shares_directions,
         )
 

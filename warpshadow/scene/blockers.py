@@ -14,7 +14,6 @@ from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.body import Body, into_own_space
 from warpshadow.scene.height_fields import Land, solid_behind
 from warpshadow.scene.scene import Scene
-from warpshadow.scene.visibility import SPHERE_METHODS
 from warpshadow.spheres import Spheres, fit_spheres
 from warpshadow.spheres.fit import STEPS, fit_seconds, is_fitted
 
@@ -53,7 +52,7 @@ def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: boo
     A flat body with the middles of all others on one side is a ground (or a wall): one sphere that touches it from
     behind stands in for it, since small spheres in a sheet would bulge out of it. A method without spheres gets none.
     """
-    if scene.visibility.with_method().method not in SPHERE_METHODS:
+    if not scene.visibility.traits.has_spheres:
         return [Spheres.concatenate([])] * len(scene.bodies)
     fits, parts = fitted_meshes(scene), _convex_parts(scene)
     _announce(fits.values(), device, progress)
@@ -76,10 +75,10 @@ def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: boo
 def blocking_planes(scene: Scene) -> tuple[int, ...]:
     """Find the bodies that block light as the planes in which they lie, in place of their spheres.
 
-    By method "directional" these are flat bodies that cast shadows, except bodies with spheres of the user's own,
+    By a method with cells these are flat bodies that cast shadows, except bodies with spheres of the user's own,
     unless light bounces.
     """
-    if scene.visibility.with_method().method != "directional":
+    if not scene.visibility.traits.has_cells:
         return ()
     has_given = [isinstance(body.blockers, Spheres) and not scene.bounces for body in scene.bodies]
     return tuple(
@@ -92,7 +91,7 @@ def blocking_planes(scene: Scene) -> tuple[int, ...]:
 def blocking_parts(scene: Scene) -> dict[int, list[ConvexPart]]:
     """Find the convex parts as which bodies block the light of others, in place of their spheres, by their numbers.
 
-    By method "directional" these are those of all bodies that consist of some, unless how many spheres they have, or
+    By a method with cells these are those of all bodies that consist of some, unless how many spheres they have, or
     that these block their own light, was asked for, or :data:`SPHERES_BESIDE_PARTS` spheres are as good as parts of
     :data:`MANY_EDGES`.
     """
@@ -115,12 +114,11 @@ def _convex_parts(scene: Scene) -> dict[int, list[ConvexPart]]:
     (:mod:`.scene.height_fields`) has flat panels alone, such as the walls of a room, unless it is a bowl in which no
     body stands behind panels.
     """
-    visibility = scene.visibility.with_method()
-    if visibility.method != "directional":
+    if not scene.visibility.traits.has_cells:
         return {}
     result = {}
     for number, body in enumerate(scene.bodies):
-        if isinstance(body.blockers, str) and body.self_shadows_in(visibility) != "spheres":
+        if isinstance(body.blockers, str) and body.self_shadows_in(scene.visibility) != "spheres":
             land = _solid_behind(scene, number)
             has_all = land is None or land.is_bowl
             result[number] = body.mesh.convex_parts if has_all else body.mesh.flat_parts
@@ -132,11 +130,10 @@ def find_solids(scene: Scene, parts: Mapping[int, Sequence[ConvexPart]]) -> froz
 
     Panels are chords of bent sheets, in which receivers do not lie; and rays to a sun may be asked for.
     """
-    visibility = scene.visibility.with_method()
     return frozenset(
         number
         for number, parts_of_body in parts.items()
-        if scene.bodies[number].self_shadows_in(visibility) == "traced" and not any(map(is_panel, parts_of_body))
+        if scene.bodies[number].self_shadows_in(scene.visibility) == "traced" and not any(map(is_panel, parts_of_body))
     )
 
 
@@ -181,7 +178,7 @@ def _solid_behind(scene: Scene, number: int) -> Land | None:
 def free_shape_remark(scene: Scene, number: int) -> str:
     """Say of a body that its spheres are few for a free shape, and how it gets others; empty if they are not."""
     body = scene.bodies[number]
-    if scene.visibility.with_method().method not in SPHERE_METHODS or not body.casts_shadow:
+    if not scene.visibility.traits.has_spheres or not body.casts_shadow:
         return ""
     called = f"body {number} ({body.name!r})"
     if _ground_spheres(scene)[number] is not None:

@@ -226,25 +226,25 @@ class Scene:
     def _check_method(self) -> None:
         """Raise ValueError for bodies, light and bounces that the named method does not show."""
         glossy = next((body for body in self.bodies if body.is_glossy), None)
-        if glossy is not None and self.visibility.method not in (*FULL_LIGHT_METHODS, None):
+        if glossy is not None and not self.visibility.traits.shows_all_light:
             raise ValueError(
                 f"roughness: got some for body {glossy.name!r}, which {self.visibility.method!r} does not show, "
                 f"expected None, or method = one of {', '.join(map(repr, FULL_LIGHT_METHODS))}"
             )
         emitter = next((body for body in self.bodies if body.is_emitter), None)
-        if emitter is not None and self.visibility.method not in (*FULL_LIGHT_METHODS, None):
+        if emitter is not None and not self.visibility.traits.shows_all_light:
             raise ValueError(
                 f"emission: got some for body {emitter.name!r}, whose light {self.visibility.method!r} lacks, "
                 f"expected None, or method = one of {', '.join(map(repr, FULL_LIGHT_METHODS))}"
             )
         if self.shell is not None:
-            if self.visibility.method not in (*FULL_LIGHT_METHODS, None):
+            if not self.visibility.traits.shows_all_light:
                 raise ValueError(
                     f"light: got a radius, which {self.visibility.method!r} does not know, expected a map without one, "
                     f"or method = one of {', '.join(map(repr, FULL_LIGHT_METHODS))}"
                 )
             check_bodies_within(self.bodies, self.shell)
-        if self.bounces and self.visibility.method not in (*BOUNCE_METHODS, None):
+        if self.bounces and not self.visibility.traits.finds_bounces:
             finders = ", ".join(map(repr, BOUNCE_METHODS))
             raise ValueError(
                 f"bounces: got {self.bounces}, which {self.visibility.method!r} does not find, expected 0, or "

@@ -14,8 +14,7 @@ def blurred_shell(scene: Scene) -> list[str]:
     A studio with a small soft box, at a radius of 3, was 16% off, and with 512 cells in place of 128 half of that.
     """
     light = scene.known_light
-    is_in_cells = scene.visibility.method in (None, "directional")
-    if scene.shell is None or not is_in_cells or not isinstance(light, EnvironmentMap):
+    if scene.shell is None or not scene.visibility.traits.has_cells or not isinstance(light, EnvironmentMap):
         return []
     powers = (light.radiance.mean(axis=2, dtype=np.float64) * light.solid_angles()[:, None]).ravel()
     solid_angles = np.repeat(light.solid_angles(), light.radiance.shape[1])

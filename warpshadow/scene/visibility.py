@@ -27,6 +27,9 @@ class MethodTraits(NamedTuple):
 
     settings: tuple[str, ...]  # of a :class:`Visibility` that it reads
     has_spheres: bool = False  # whether these stand in for bodies
+    has_cells: bool = False  # whether it finds shadows in cells, past planes and convex parts, too
+    every_sample_receives: bool = False  # whether every sample is a receiver, overriding the bodies
+    has_shadows: bool = True
     finds_bounces: bool = True  # whether light may bounce
     shows_all_light: bool = True  # whether bodies may shine or emit, and light may be near
     tuned: tuple[str, ...] = ()  # settings that tuning varies
@@ -34,7 +37,10 @@ class MethodTraits(NamedTuple):
 
 METHOD_TRAITS = {
     "directional": MethodTraits(
-        ("directions", "softness", "merging", "self_shadows", "samples"), has_spheres=True, tuned=("directions",)
+        ("directions", "softness", "merging", "self_shadows", "samples"),
+        has_spheres=True,
+        has_cells=True,
+        tuned=("directions",),
     ),
     "log-sh": MethodTraits(
         ("merging", "self_shadows", "order", "log", "base"),
@@ -42,8 +48,8 @@ METHOD_TRAITS = {
         shows_all_light=False,
         tuned=("log", "order"),
     ),
-    "none": MethodTraits(("order",), finds_bounces=False),
-    "ray-traced": MethodTraits(("order", "samples", "sampling")),
+    "none": MethodTraits(("order",), has_shadows=False, finds_bounces=False),
+    "ray-traced": MethodTraits(("order", "samples", "sampling"), every_sample_receives=True),
     AUTO: MethodTraits(("softness", "merging", "self_shadows", "order", "error")),  # some are left to the chosen one
 }
 METHODS = tuple(method for method in METHOD_TRAITS if method != AUTO)
@@ -125,7 +131,7 @@ class Visibility:
         reader = self.method or DEFAULT_METHOD
         changed = [name for name in METHODS_OF_SETTING if getattr(self, name) != getattr(Visibility, name)]
         for name in changed:
-            if name not in METHOD_TRAITS[reader].settings:
+            if name not in self.traits.settings:
                 readers = " or ".join(map(repr, METHODS_OF_SETTING[name]))
                 raise ValueError(
                     f"{name}: got {getattr(self, name)!r}, which {reader!r} does not read, expected the default, "
@@ -153,6 +159,11 @@ class Visibility:
         check_merging(self.merging)
 
     @property
+    def traits(self) -> MethodTraits:
+        """Of the method; where none is named, of that of renderers."""
+        return METHOD_TRAITS[self.method or DEFAULT_METHOD]
+
+    @property
     def ray_count(self) -> int:
         """Number of rays: ``samples``, or as many as the method has by default."""
         if self.samples is not None:
@@ -166,8 +177,7 @@ class Visibility:
         every = object.__new__(cls)
         vars(every).update(settings)
         every._check_values()
-        reader = every.method or DEFAULT_METHOD
-        return cls(every.method, **{name: getattr(every, name) for name in METHOD_TRAITS[reader].settings})
+        return cls(every.method, **{name: getattr(every, name) for name in every.traits.settings})
 
     def with_method(self) -> Visibility:
         """The same by "directional" where no method is named, as renderers have it."""

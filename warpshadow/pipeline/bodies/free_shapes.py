@@ -10,7 +10,6 @@ from warpshadow.pipeline.bodies.geometry import Geometry, as_geometry, splice
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.scene.blockers import free_shape_remark
 from warpshadow.scene.scene import BodyLike
-from warpshadow.scene.visibility import SPHERE_METHODS
 from warpshadow.stages.geometry.bound_spheres import SphereBinding
 from warpshadow.stages.geometry.deform import DeformationGraph
 
@@ -100,7 +99,7 @@ class FreeShapes:
     def _refuse_other_vertices(self, number: int) -> None:
         """Raise ValueError for other vertices of a flat body where light bounces by spheres."""
         scene = self._merged_scene.scene
-        if scene.visibility.method in SPHERE_METHODS:
+        if scene.visibility.traits.has_spheres:
             raise ValueError(
                 f"positions: got some for body {number} ({scene.bodies[number].name!r}), which is flat; "
                 f"expected None where light bounces (scene.bounces is {scene.bounces}), since a flat body "

@@ -18,7 +18,7 @@ from warpshadow.maths.spatial_sort import z_order
 from warpshadow.pipeline.bodies.geometry import CENTER, Geometry, Pivot, as_geometry, splice
 from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import BodyLike, Scene
-from warpshadow.scene.visibility import AUTO, SPHERE_METHODS
+from warpshadow.scene.visibility import AUTO
 from warpshadow.spheres import MANY, Spheres
 from warpshadow.stages.geometry.poses import Poses
 
@@ -110,8 +110,8 @@ class MergedScene:
 
         On bodies that are shaded at vertices mean slopes (:mod:`warpshadow.stages.image.slopes`) go across creases.
         """
-        is_traced = self.scene.visibility.method == "ray-traced"  # which shades all by pixel
-        is_by_pixel = [is_traced or body.receivers == "pixel" for body in self.scene.bodies]
+        is_all = self.scene.visibility.traits.every_sample_receives
+        is_by_pixel = [is_all or body.receivers == "pixel" for body in self.scene.bodies]
         result = np.zeros(self.first_face[-1], np.int32)
         for body in np.flatnonzero(is_by_pixel):
             result[self.first_face[body] : self.first_face[body + 1]] = self.scene.bodies[body].mesh.creases
@@ -231,7 +231,7 @@ class MergedScene:
         """Number of spheres of each body, shape [body]; until they are fitted, how many are asked for, or 64."""
         if "body_spheres" in self.__dict__:
             return np.diff(self.first_sphere)
-        if self.scene.visibility.method not in SPHERE_METHODS:
+        if not self.scene.visibility.traits.has_spheres:
             return np.zeros(len(self.scene.bodies), int)
         blockers = (MANY if body.blockers == AUTO else body.blockers for body in self.scene.bodies)
         return np.array([len(spheres) if isinstance(spheres, Spheres) else spheres for spheres in blockers])

@@ -180,11 +180,8 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     @functools.cached_property
     def scene_blockers(self) -> SceneBlockers:
         """The blockers that the bodies are: planes, too, and convex parts."""
-        scene, samples_receive = self.merged_scene.scene, self.samples_receive()
-        planes, progress = blocking_planes(scene), self.progress
-        return SceneBlockers(
-            self.merged_scene, samples_receive, plane_blockers=planes, has_convex_parts=True, progress=progress
-        )
+        planes = blocking_planes(self.merged_scene.scene)
+        return SceneBlockers(self.merged_scene, plane_blockers=planes, has_convex_parts=True, progress=self.progress)
 
     def find_visibility_past_planes(
         self, group: Group, visibility: CellVisibility, projected_light: ProjectedCells

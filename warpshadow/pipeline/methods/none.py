@@ -31,7 +31,7 @@ class NoShadows(LogSH):
     @functools.cached_property
     def scene_blockers(self) -> SceneBlockers:
         """Bodies that block nothing."""
-        return SceneBlockers(self.merged_scene, self.samples_receive(), traces_self_visibility=False)
+        return SceneBlockers(self.merged_scene, traces_self_visibility=False)
 
     def project_light(self, light: KnownLight, shell: wp.array | None = None) -> ProjectedBands:
         """The bands that the light has, or its patches."""

@@ -39,7 +39,6 @@ _EVEN_RAYS = 128  # directions in which receivers that shine look for how much o
 class RayTraced(Method):
     """Visibility of the meshes."""
 
-    every_sample_receives = True
     shares_lobes = True
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):

@@ -121,7 +121,8 @@ def choose_receivers(
         is_light_free: Whether light is given as coefficients, so that nobody knows where shadows will have edges.
         near_light: Of emitters; None without any.
     """
-    if merged_scene.scene.visibility.method == "ray-traced":  # every sample is a receiver, overriding the bodies
+    traits = merged_scene.scene.visibility.traits
+    if traits.every_sample_receives:
         return [ReceiverChoice(body.receivers, None) for body in merged_scene.scene.bodies]
     requested = ["pixel" if body.is_glossy else body.receivers for body in merged_scene.scene.bodies]
     if AUTO not in requested:
@@ -131,8 +132,7 @@ def choose_receivers(
     sizes = face_sizes(images, merged_scene, cameras[0])
     share = LARGE_SHARE * cameras[0].width * cameras[0].height
     largest = min(max(LARGE_FACE, share), COARSE_FACE)
-    has_edges = merged_scene.scene.visibility.method == "directional" and not is_light_free
-    is_sharp = has_edges and merged_scene.device.is_cpu
+    is_sharp = traits.has_cells and not is_light_free and merged_scene.device.is_cpu
     has_few = np.diff(merged_scene.first_face) <= FEW_FACES
     limits = np.where(has_few, 1.0, largest)
     chosen = np.where([size.exceeds(limit) for size, limit in zip(sizes, limits, strict=True)], "pixel", "vertex")
@@ -144,7 +144,7 @@ def choose_receivers(
     is_undecided = (chosen == "vertex") & (np.array(requested) == AUTO) & (~merged_scene.is_flat | is_sharp)
     unevenness, shows_buried = np.zeros(len(chosen)), np.zeros(len(chosen), bool)
     max_unevenness = UNEVEN * np.array([min(1.0, UNEVEN_SHARE * largest / (size.area or 1.0)) ** 0.5 for size in sizes])
-    if is_undecided.any() and merged_scene.scene.visibility.method != "none":
+    if is_undecided.any() and traits.has_shadows:
         faces = [np.unique(face_ids[face_ids >= 0], return_counts=True) for face_ids, _ in images]
         shown_faces = [(camera, *counted) for camera, counted in zip(cameras, faces, strict=True)]
         light = EnvironmentMap.constant() if is_light_free else merged_scene.scene.known_light
@@ -204,8 +204,8 @@ def for_picture(scene: Scene) -> Scene:
 
 
 def _has_sun(scene: Scene) -> bool:
-    """Whether the directional method is to find shadows of a sun."""
-    if scene.visibility.method != "directional" or scene.shell is not None:
+    """Whether shadows of a sun are to be found in cells."""
+    if not scene.visibility.traits.has_cells or scene.shell is not None:
         return False
     cell_light = scene.known_light.cells(fibonacci(scene.direction_count))
     if cell_light.spots is None or cell_light.half_angles is None:

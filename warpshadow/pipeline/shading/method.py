@@ -1,10 +1,10 @@
-"""The interface of methods of visibility: how light is blocked, and which vertices and samples receive it."""
+"""The interface of methods of visibility: how light is blocked."""
 
 from __future__ import annotations
 
 import abc
 import functools
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,10 +24,8 @@ from warpshadow.pipeline.receivers.lit_points import (
     VisibleSurfaces,
     receiver_text,
 )
-from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.transfers import Light, check_light, shade_free
-from warpshadow.stages.receivers.find import Numbering, number_receivers
 from warpshadow.stages.receivers.quadtree import Quadtree
 from warpshadow.stages.shell.beams import check_shell, shell_array
 
@@ -53,7 +51,7 @@ class Method(abc.ABC):
     | :meth:`along_paths` | light that bounces along paths (:func:`.choose_bouncing`) | refused |
     | :meth:`blocker_kinds` | planes, convex parts, traced self-visibility | spheres alone |
     | :meth:`find_squares` | adaptive receivers | None, where every sample receives light |
-    | the four fields below | as they say | False |
+    | the three fields below | as they say | False |
 
     A scene is refused whose bodies shine or emit, or whose light is near or bounces, where the method's row of
     ``METHOD_TRAITS`` (:mod:`warpshadow.scene.visibility`) says no: the method then needs no member for that.
@@ -64,11 +62,7 @@ class Method(abc.ABC):
         basis: Basis of free light; None for the method's own.
     """
 
-    every_sample_receives = False  # whether every sample is a receiver, overriding the bodies
-
     widens_edges = False  # whether edges of a sun's shadow on flat bodies are as wide as receivers' footprints
-
-    spheres_stand_in = False  # whether spheres stand in for bodies, by which light bounces where these move
 
     shares_directions = False
     """Whether all receivers look for light in the same directions, so that one is enough for a surface in a pixel."""
@@ -82,9 +76,6 @@ class Method(abc.ABC):
         self.basis = native_basis if basis is None else basis
         self.visibility = merged_scene.scene.visibility
         self.light = LightInput(merged_scene.scene.known_light)
-        self._numberings: dict[Hashable, list[Numbering]] = {}
-        self._can_receive: dict[tuple[int, ...], np.ndarray] = {}  # by the bodies out of which spheres bulge
-        self.has_emitters = bool(merged_scene.is_emitter.any())
         shell = merged_scene.scene.shell
         self.shell = None if shell is None else shell_array(shell, merged_scene.device)
 
@@ -96,65 +87,9 @@ class Method(abc.ABC):
         """
         return ONLY_SPHERES
 
-    def samples_receive(self, blocker_kinds: BlockerKinds = ONLY_SPHERES) -> np.ndarray:
-        """Bodies on which samples are receivers while bodies block in some ways, bool of shape [body]."""
-        bodies = enumerate(self.merged_scene.scene.bodies)
-        by_vertex = [body.receivers == "vertex" or number in blocker_kinds.bulging_bodies for number, body in bodies]
-        return ~np.array(by_vertex) | self.every_sample_receives
-
-    @functools.cached_property
-    def is_adaptive(self) -> np.ndarray:
-        """Flat bodies on which samples interpolate between receivers, bool of shape [body].
-
-        No body where one emits or light is near: probes look at the brightest cells of the map, which tell nothing of
-        the shadows of such light.
-        """
-        adaptive = np.array([body.receivers == "adaptive" for body in self.merged_scene.scene.bodies])
-        is_known = not (self.every_sample_receives or self.has_emitters or self.shell is not None)
-        return adaptive & self.merged_scene.is_flat & is_known
-
     def find_squares(self, blocker_kinds: BlockerKinds, surfaces: VisibleSurfaces) -> Quadtree | None:
         """Find the squares in which samples of adaptive bodies interpolate (:func:`.adaptive.find_squares`)."""
         return None
-
-    def can_receive(self, blocker_kinds: BlockerKinds) -> np.ndarray:
-        """Vertices that may be receivers, and vertices whose backs may be, bool of shape [2, vertex]."""
-        key = blocker_kinds.bulging_bodies
-        if key not in self._can_receive:
-            body_of_vertex, receives = self.merged_scene.body_of_vertex, ~self.samples_receive(blocker_kinds)
-            backs = (receives & self.merged_scene.is_two_sided)[body_of_vertex]
-            self._can_receive[key] = np.stack([receives[body_of_vertex], backs])
-        return self._can_receive[key]
-
-    def separate_bodies(self, blocker_kinds: BlockerKinds) -> np.ndarray | None:
-        """Number of each body whose receivers form a group, −1 for others, shape [body]; None where all share one."""
-        bodies = range(len(self.merged_scene.scene.bodies))
-        if self.merged_scene.scene.bounces or self.has_emitters:
-            return np.array(bodies)
-        separate = {*blocker_kinds.separate, *np.flatnonzero(self.merged_scene.is_glossy).tolist()}
-        return np.array([body if body in separate else -1 for body in bodies]) if separate else None
-
-    def numbering(
-        self, blocker_kinds: BlockerKinds, has_backs: bool, static_bodies: StaticBodies | None = None
-    ) -> Numbering:
-        """Number all vertices, or all with their backs.
-
-        Both numberings are made at once, since a capture cannot make constants. Backs of static bodies are in both, so
-        that rows cached for one serve the other.
-        """
-        moving = None if static_bodies is None else static_bodies.moving
-        key = frozenset(blocker_kinds.separate), blocker_kinds.bulging_bodies, moving
-        if key not in self._numberings:
-            device = self.merged_scene.device
-            can_receive, separate_bodies = self.can_receive(blocker_kinds), self.separate_bodies(blocker_kinds)
-            bodies = None if separate_bodies is None else separate_bodies[self.merged_scene.body_of_vertex]
-            is_static = None if static_bodies is None else static_bodies.has_vertex
-            fronts = can_receive[:1]
-            if is_static is not None and (can_receive[1] & is_static).any():
-                fronts = np.stack([can_receive[0], can_receive[1] & is_static])
-            sides = fronts, can_receive
-            self._numberings[key] = [number_receivers(item, is_static, bodies=bodies, device=device) for item in sides]
-        return self._numberings[key][has_backs]
 
     @functools.cached_property
     def emitters(self) -> SceneEmitters:

@@ -14,6 +14,7 @@ from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Blockers, BodySides
 from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
 
 
 class SceneBlockers:
@@ -21,7 +22,6 @@ class SceneBlockers:
 
     Args:
         merged_scene: The bodies.
-        samples_receive: Bodies on which samples are receivers, bool of shape [body].
         plane_blockers: Bodies that block as the planes in which they lie, where they are not deformed.
         has_convex_parts: Whether bodies that consist of convex parts block by these.
         traces_self_visibility: Whether bodies' shadows on themselves may come from rays, not spheres.
@@ -35,7 +35,6 @@ class SceneBlockers:
     def __init__(
         self,
         merged_scene: MergedScene,
-        samples_receive: np.ndarray,
         *,
         plane_blockers: tuple[int, ...] = (),
         has_convex_parts: bool = False,
@@ -45,7 +44,9 @@ class SceneBlockers:
         self._merged_scene, self.plane_blockers = merged_scene, plane_blockers
         self._has_convex_parts, self._traces_self_visibility = has_convex_parts, traces_self_visibility
         self.planes, self.parts = ScenePlanes(merged_scene), SceneConvexParts(merged_scene)
-        self.self_visibility = SelfVisibility(merged_scene, samples_receive, progress=progress)
+        self.self_visibility = SelfVisibility(
+            merged_scene, SceneReceivers(merged_scene).at_samples(), progress=progress
+        )
 
     def kinds(self, geometry: Geometry | None, rotations: Input | None) -> BlockerKinds:
         """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default.

@@ -80,7 +80,6 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     why_no_shadows = ""
     adds_cached_rows = False
     shades_transmittance = False
-    spheres_stand_in = True
 
     @property
     def emitter_cells(self) -> Projected | None:
@@ -90,7 +89,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     @functools.cached_property
     def scene_blockers(self) -> SceneBlockers:
         """The blockers that the bodies are."""
-        return SceneBlockers(self.merged_scene, self.samples_receive(), progress=self.progress)
+        return SceneBlockers(self.merged_scene, progress=self.progress)
 
     def blocker_kinds(self, geometry: Geometry | None, rotations: Input | None) -> BlockerKinds:
         """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default."""

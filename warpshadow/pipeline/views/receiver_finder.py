@@ -8,6 +8,7 @@ import warp as wp
 from warpshadow.device.constants import gather_of_owners
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, VisibleSurfaces
+from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.image.slopes import find_mean_slopes
@@ -28,17 +29,23 @@ class ReceiverFinder:
 
     Args:
         method: Method of visibility.
+        scene_receivers: Where bodies have receivers.
         blocker_kinds: Which bodies block light by something else than their spheres.
         static_bodies: Those among moving ones; None where any may move.
         supersampling: Samples of a pixel across and down.
     """
 
     def __init__(
-        self, method: Method, blocker_kinds: BlockerKinds, static_bodies: StaticBodies | None, supersampling: int
+        self,
+        method: Method,
+        scene_receivers: SceneReceivers,
+        blocker_kinds: BlockerKinds,
+        static_bodies: StaticBodies | None,
+        supersampling: int,
     ):
-        self._method, self._blocker_kinds, self._static_bodies = method, blocker_kinds, static_bodies
-        self._merged_scene = method.merged_scene
-        self._separate_bodies = method.separate_bodies(blocker_kinds)
+        self._method, self._merged_scene, self._scene_receivers = method, method.merged_scene, scene_receivers
+        self._blocker_kinds, self._static_bodies = blocker_kinds, static_bodies
+        self._separate_bodies = scene_receivers.separate_bodies(blocker_kinds)
         self._supersampling = supersampling
         self._may_share_surfaces = method.shares_directions and supersampling <= MAX_SHARED_SAMPLES
 
@@ -61,17 +68,20 @@ class ReceiverFinder:
             spheres: Centers and radii of all spheres, where bodies are adaptive.
         Differentiable: positions, normals, barycentrics of the fragments.
         """
-        method, merged_scene, quadtree, has_mean_slope = self._method, self._merged_scene, None, None
+        method, merged_scene, scene_receivers = self._method, self._merged_scene, self._scene_receivers
+        quadtree, has_mean_slope = None, None
         size = fragments.face_ids.shape[1] // self._supersampling, fragments.face_ids.shape[2] // self._supersampling
         footprints_of = functools.partial(self._find_footprints, positions, clip_positions, size)
-        has_backs, at_samples = fragments.sides is not None, method.samples_receive(self._blocker_kinds)
+        has_backs, at_samples = fragments.sides is not None, scene_receivers.at_samples(self._blocker_kinds)
         if not is_readable(merged_scene.device):
-            numbering = method.numbering(self._blocker_kinds, has_backs, self._static_bodies)
+            numbering = scene_receivers.number_all(self._blocker_kinds, has_backs, self._static_bodies)
         else:
-            has_cached_rows = method.is_adaptive & self._bodies_with_cached_rows()  # cheaper than receivers at samples
+            has_cached_rows = (
+                scene_receivers.is_adaptive & self._bodies_with_cached_rows()
+            )  # cheaper than receivers at samples
             at_samples = at_samples & ~has_cached_rows
             numbering = self._number_seen(seen_vertices(fragments, silhouettes, positions.shape[1]), has_cached_rows)
-            if spheres is not None and (is_adaptive := method.is_adaptive & at_samples).any():
+            if spheres is not None and (is_adaptive := scene_receivers.is_adaptive & at_samples).any():
                 surfaces = VisibleSurfaces(
                     positions, normals, fragments, spheres, is_adaptive, self._supersampling, footprints_of
                 )
@@ -92,7 +102,7 @@ class ReceiverFinder:
             bodies=None if separate is None else gather_of_owners(separate, body_of_face),
             supersampling=1 if method.shares_directions and not shares_surfaces else self._supersampling,
             quadtree=quadtree,
-            rises=method.every_sample_receives,
+            rises=scene_receivers.at_all_samples,
             smooth_pieces=merged_scene.smooth_pieces if shares_surfaces else None,
             has_mean_slope=has_mean_slope,
             shares_receivers=None if method.shares_lobes else gather_of_owners(~merged_scene.is_glossy, body_of_face),
@@ -126,7 +136,7 @@ class ReceiverFinder:
     def _number_seen(self, is_seen: np.ndarray, has_cached_rows: np.ndarray) -> Numbering:
         """Number the vertices that are seen, of bodies with receivers there and of bodies with cached rows."""
         merged_scene, static_bodies, separate = self._merged_scene, self._static_bodies, self._separate_bodies
-        keeps_vertex = self._method.can_receive(self._blocker_kinds)[: len(is_seen)] & is_seen
+        keeps_vertex = self._scene_receivers.at_vertices(self._blocker_kinds)[: len(is_seen)] & is_seen
         if has_cached_rows.any():
             keeps_vertex |= gather_of_owners(has_cached_rows, merged_scene.body_of_vertex) & is_seen
         return number_receivers(

@@ -21,6 +21,7 @@ from warpshadow.pipeline.bodies.geometry import PLACED, Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Clock, Input, Node, identity
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
+from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.view import View
@@ -47,7 +48,7 @@ class SceneViews:
     def __init__(self, transport: LightTransport, materials: Materials, cameras: Sequence[Camera], clock: Clock):
         self._transport, self._method = transport, transport.method
         merged_scene = self._merged_scene = self._method.merged_scene
-        self._materials, self._clock = materials, clock
+        self._materials, self._clock, self._receivers = materials, clock, SceneReceivers(merged_scene)
         self.vertices = Input("vertices", lambda: merged_scene.scene_geometry.positions)
         self._spheres = Input(
             "spheres", lambda: (merged_scene.scene_geometry.centers, merged_scene.scene_geometry.radii)
@@ -120,11 +121,7 @@ class SceneViews:
             matrices = clip_matrices
             cameras = Input.renewed("cameras", matrices, self._last_cameras)
         image_count = common_batch({"geometry": poses, "clip_matrices": matrices})
-        # rows of static bodies are valid only where nothing of moving bodies reaches them, neither rays nor bounced
-        # light nor light of lamps; and rows are of light from infinitely far away, not from a shell
-        sends_light = self._merged_scene.scene.bounces or self._method.has_emitters
-        caches_rows = not (self._method.every_sample_receives or sends_light or self._method.shell is not None)
-        if geometry is not None and geometry.moving is not None and caches_rows:
+        if geometry is not None and geometry.moving is not None and self._receivers.caches_rows:
             static_bodies = self._static.get(geometry.moving)
             if static_bodies is None or not static_bodies.matches(geometry):
                 static_bodies = StaticBodies(self._merged_scene, geometry)
@@ -137,6 +134,7 @@ class SceneViews:
             check_clip_space(clip_matrices)
         return View(
             self._transport,
+            self._receivers,
             self._materials,
             *arguments,
             call=self.call(),
@@ -188,7 +186,7 @@ class SceneViews:
         Differentiable: geometry.
         """
         merged_scene, blocker_kinds, bodies = self._merged_scene, self._blocker_kinds(geometry), self._bodies(geometry)
-        owners = self._method.separate_bodies(blocker_kinds)
+        owners = self._receivers.separate_bodies(blocker_kinds)
         if owners is not None:
             owners = owners[merged_scene.body_of_face[sides % len(merged_scene.body_of_face)]]
         normals = Node("", vertex_normals, bodies[0], merged_scene.faces)

@@ -10,6 +10,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.bodies.reflectance import Materials, SampleReflectance
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, field_of, identity
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.transport import LightTransport
@@ -38,6 +39,7 @@ class View(LitPoints):
 
     Args:
         transport: Light on receivers, by a method of visibility.
+        scene_receivers: Where bodies have receivers.
         materials: Reflectance of the scene's bodies.
         vertices: Positions of all vertices.
         spheres: Centers and radii of the spheres.
@@ -56,6 +58,7 @@ class View(LitPoints):
     def __init__(
         self,
         transport: LightTransport,
+        scene_receivers: SceneReceivers,
         materials: Materials,
         vertices: Input,
         spheres: Input,
@@ -71,7 +74,7 @@ class View(LitPoints):
         self.dependencies = vertices, spheres, cameras, static_bodies, blocker_kinds
         self.transport, self.method = transport, transport.method
         method = self.method
-        self._samples_receive = method.samples_receive(blocker_kinds)
+        self._scene_receivers = scene_receivers
         self.cameras = cameras
         self._camera, self._supersampling, self._pose_count = camera, method.merged_scene.scene.supersampling, counts[0]
         self._size = self._supersampling * camera.width, self._supersampling * camera.height
@@ -116,12 +119,12 @@ class View(LitPoints):
         else:
             normals = Node("normals", static_bodies.with_moving_normals, vertices, static_bodies.normals, items=corners)
         # receivers at vertices move with these alone; receivers at samples move with the samples' fragments, too
-        seen = sides if self._samples_receive.any() else detached(sides)
+        seen = sides if self._scene_receivers.at_samples(blocker_kinds).any() else detached(sides)
         item_text = functools.partial(receiver_text, self.weak)
         arguments = [vertices, normals, seen, detached(silhouettes), detached(clip)]
-        if method.is_adaptive.any():
+        if self._scene_receivers.is_adaptive.any():
             arguments.append(detached(spheres))
-        finder = ReceiverFinder(method, blocker_kinds, static_bodies, self._supersampling)
+        finder = ReceiverFinder(method, self._scene_receivers, blocker_kinds, static_bodies, self._supersampling)
         receivers = Node("receivers", finder.find, *arguments, items=item_text)
         self.clip_positions, self.fragments_node, self.silhouettes = clip, sides, silhouettes
         return normals, receivers
@@ -319,11 +322,11 @@ class View(LitPoints):
         """How many receivers may move and how many are static; "up to " where they are not found yet."""
         if self.receivers_node.value_if_known(self.call) is not None:
             return super().counts()
-        can_receive, static = self.method.can_receive(self.blocker_kinds), 0
+        at_vertices, static = self._scene_receivers.at_vertices(self.blocker_kinds), 0
         if self.static_bodies is not None:
-            static = int((can_receive & self.static_bodies.has_vertex).sum())
-        samples = self._sample_count * self._samples_receive.any()
-        return "up to ", int(self._pose_count * (can_receive.sum() - static) + samples), static
+            static = int((at_vertices & self.static_bodies.has_vertex).sum())
+        samples = self._sample_count * self._scene_receivers.at_samples(self.blocker_kinds).any()
+        return "up to ", int(self._pose_count * (at_vertices.sum() - static) + samples), static
 
     def _vertices(self) -> str:
         count, static = int(self.merged_scene.first_vertex[-1]), 0
