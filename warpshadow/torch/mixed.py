@@ -99,10 +99,7 @@ class MixedRenderer(torch.nn.Module):
         Differentiable: all but which.
         """
         batch = _Batch(which, len(self.renderers))
-        whole_inputs = {
-            name: batch.split(name, getattr(inputs, name), ndim)
-            for name, ndim in (("light", 2), ("clip_matrices", 2), ("shell", 1))
-        }
+        whole_inputs = {name: batch.split(name, *entry) for name, entry in inputs.of_images.items()}
         of_bodies = {
             name: {
                 body: self._split_item(batch, name, body, tensor)

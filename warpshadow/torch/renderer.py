@@ -1,5 +1,6 @@
 """A renderer of one scene, whose arguments are tensors."""
 
+import dataclasses
 import functools
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -248,7 +249,7 @@ class TorchRenderer(torch.nn.Module):
         light, geometry, clip_matrices = inputs.light, inputs.geometry, inputs.clip_matrices
         has_cameras = self.warp.has_camera_batch and clip_matrices is None
         arguments = Arguments(self.device, cameras=self.cameras if has_cameras else None)
-        slots: dict[str, Any] = {"light": light}
+        slots: dict[str, Any] = {}
         if isinstance(light, torch.Tensor):
             description = describe_coefficients(self.basis, light.shape[-2] if light.ndim > 1 else 0)
             if light.ndim == 3 and light.shape[1] == 2 * light.shape[0]:
@@ -273,7 +274,8 @@ class TorchRenderer(torch.nn.Module):
                     body_rows = self._body_rows(name, number, tensor)
                     of_bodies[number] = arguments.add(f"{name}[{number}]", *body_rows, message_name=message_name)
             slots[name] = of_bodies
-        return arguments, ImageInputs(**slots)
+        filled_inputs: Any = dataclasses.replace(inputs, **slots)  # tensors without a slot stay, and fail
+        return arguments, filled_inputs
 
     def _body_rows(
         self, name: str, number: int, tensor: torch.Tensor
