@@ -13,7 +13,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.basis import Basis, describe_coefficients
 from warpshadow.assets.camera import Camera
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import announced, one_at_a_time
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.bodies.geometry import GEOMETRY_DTYPES, Geometry, Pivot
 from warpshadow.pipeline.explain import Explanation
@@ -134,6 +134,11 @@ class TorchRenderer(torch.nn.Module):
         """Device of its tensors."""
         return torch.device(wp.device_to_torch(self.warp.device))
 
+    @property
+    def progress(self) -> bool:
+        """Whether it shows its progress."""
+        return self.warp.progress
+
     def _apply(self, fn: Callable[[torch.Tensor], torch.Tensor], recurse: bool = True) -> "TorchRenderer":
         """Go where a tensor would go: torch calls this for ``to``, ``cuda``, ``half`` and the like."""
         try:
@@ -165,7 +170,7 @@ class TorchRenderer(torch.nn.Module):
 
     @uncompiled
     @takes(ImageTensors, **_ELSEWHERE)
-    @one_at_a_time
+    @announced
     def forward(self, inputs: ImageTensors) -> torch.Tensor:
         """Render images.
 
@@ -213,7 +218,7 @@ class TorchRenderer(torch.nn.Module):
 
     @uncompiled
     @takes(ImageTensors, **_ELSEWHERE)
-    @one_at_a_time
+    @announced
     def insert(self, photograph: torch.Tensor, inputs: ImageTensors) -> torch.Tensor:
         """Render the bodies in a photograph whose surfaces the scene's shadow catchers model.
 

@@ -292,7 +292,6 @@ class MergedScene:
         """Where the scene has its bodies and their spheres; the batch is 1."""
         return self.placed()
 
-    @one_at_a_time
     def placed(
         self,
         poses: Poses | None = None,

@@ -12,6 +12,7 @@ import warp as wp
 
 from warpshadow.assets.known_light import KnownLight
 from warpshadow.assets.light import EnvironmentMap
+from warpshadow.device.constants import Identity
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
@@ -428,7 +429,7 @@ def blockers_node(method: SphereMethod, points: LitPoints) -> Node:
 def self_visibility_node(method: SphereMethod, points: LitPoints, projected_light: Node | ProjectedLight) -> Node:
     """Node of the receivers' self-visibility lookups, by body; the same for any receivers among the same bodies."""
     make = functools.partial(_self_visibility, method, points.blocker_kinds, projected_light)
-    return points.cached_of_bodies("self-visibility", id(projected_light), make)
+    return points.cached_of_bodies("self-visibility", Identity(projected_light), make)
 
 
 def _self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds, projected_light: Node | ProjectedLight) -> Node:
