@@ -10,11 +10,10 @@ from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar, overload
 
-import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.light import KnownLightArgument
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.scene.material import INPUTS_OF_BODIES
 from warpshadow.scene.scene import PerBody
@@ -57,7 +56,7 @@ class ImageInputs(Generic[Array, Placed]):
             TorchRenderer's ``clip_matrices``; by default the renderer's own.
     """
 
-    light: Array | EnvironmentMap | np.ndarray | None = field(default=None, metadata={_DIMENSIONS: 2})
+    light: Array | KnownLightArgument | None = field(default=None, metadata={_DIMENSIONS: 2})
     _: KW_ONLY
     albedo: PerBody[Array] | None = None
     textures: PerBody[Array] | None = None

@@ -14,7 +14,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.basis import Basis, check_basis
 from warpshadow.assets.camera import Camera
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.light import KnownLightArgument
 from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
@@ -78,6 +78,9 @@ class SceneRenderer:
         cameras: The cameras of the scene.
         has_camera_batch: Whether they were given as a batch.
         basis: Basis of free light.
+        device: Device of its arrays.
+        progress: Whether it shows its progress.
+        merged_scene: The bodies as one mesh.
         clock: How long stages took; with ``clock.waits``, stages on a GPU are waited for.
 
     Threads may share it: their calls come one after another. Copied or pickled, it takes along its arguments, and the
@@ -328,7 +331,7 @@ class SceneRenderer:
         return view.image(light, self.materials(inputs.of_bodies)).value(self._views.call(view))
 
     @check.keywords(**dict.fromkeys(("camera", "cameras"), "renderer.with_cameras([camera]).render()"))
-    def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
+    def render(self, light: KnownLightArgument | None = None) -> np.ndarray:
         """Render the image of the scene.
 
         Args:

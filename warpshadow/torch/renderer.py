@@ -179,7 +179,8 @@ class TorchRenderer(torch.nn.Module):
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or [batch, height, width, 4]
             where an argument has a batch dimension or the renderer's own cameras have; the background is 0.
-        Differentiable: all; stages/README.md says how exactly. Gradients to light and emission,
+        Differentiable: all; by "ray-traced" not geometry, clip_matrices and shell. stages/README.md says how exactly.
+            Gradients to light and emission,
             and where no light bounces to albedo and textures, may be differentiated again, in all tensors;
             others raise NotImplementedError then.
         """
@@ -326,9 +327,9 @@ class TorchRenderer(torch.nn.Module):
             scales: Of each body, [body] or [batch, body]; by default the scene's.
             rest: The bodies in their own spaces, from :meth:`deformed`; by default as their meshes are.
             moving: Bodies that the poses move, by number or name; None for any. The others stand where the scene has
-                them, without a gradient, and where light neither bounces nor is near results about them are cached. By
-                "directional" these come from rays against their meshes, so that they shadow each other by meshes.
-                Bodies that ``rest`` deforms count as moving.
+                them, without a gradient, and results about them are cached, but not where light bounces or is near,
+                with lamps, or by rays. By "directional" these come from rays against their meshes, so that they shadow
+                each other by meshes. Bodies that ``rest`` deforms count as moving.
             pivot: Point of each body's own space that it is turned about and that ``translations`` put in its place:
                 "center", the middle of its mesh's bounds, or points, [body, 3] or [batch, body, 3]; None for the
                 origin, which is the one of the mesh's file. ``scene_poses(pivot=…)`` are the poses to begin with.

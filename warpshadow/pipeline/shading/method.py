@@ -53,7 +53,7 @@ class Method(abc.ABC):
     | :meth:`along_paths` | light that bounces along paths (:func:`.choose_bouncing`) | refused |
     | :meth:`blocker_kinds` | planes, convex parts, traced self-visibility | spheres alone |
     | :meth:`find_squares` | adaptive receivers | None, where every sample receives light |
-    | the four fields below | as they say | False |
+    | the five fields below | as they say | False |
 
     A scene is refused whose bodies shine or emit, or whose light is near or bounces, where the method's row of
     ``METHOD_TRAITS`` (:mod:`warpshadow.scene.visibility`) says no: the method then needs no member for that.
