@@ -13,7 +13,7 @@ class MaterialField(NamedTuple):
 
     Args:
         name: Of the field of a body, of the key of a scene file, and of the argument of a renderer.
-        default: Of a body that does not say. A roughness makes a body shine; others need a number in arrays of all.
+        default: Value for bodies without the number; of roughness a filler in arrays, since such bodies are diffuse.
         minimum, maximum: The range that is accepted.
         is_in_files: Whether materials of meshes' files have it, as glTF's do.
     """

@@ -34,7 +34,7 @@ MixedTensors = ImageInputs[torch.Tensor, Sequence[Geometry[torch.Tensor] | None]
 
 
 class _Placed(list[Geometry[torch.Tensor] | None]):
-    """Geometries of scenes, and which scene each image was of when they were placed; None where all had one pose."""
+    """Geometries of the scenes; ``which`` as it was when they were placed, None if one pose serves all images."""
 
     which: tuple[int, ...] | None = None
 

@@ -97,7 +97,10 @@ class Method(abc.ABC):
         return ONLY_SPHERES
 
     def samples_receive(self, blocker_kinds: BlockerKinds = ONLY_SPHERES) -> np.ndarray:
-        """Bodies on which samples are receivers while bodies block in some ways, bool of shape [body]."""
+        """Whether each body is lit at samples, not at vertices, given the kinds of blockers; bool of shape [body].
+
+        Bodies out of which their own spheres bulge are lit at vertices.
+        """
         bodies = enumerate(self.merged_scene.scene.bodies)
         by_vertex = [body.receivers == "vertex" or number in blocker_kinds.bulging_bodies for number, body in bodies]
         return ~np.array(by_vertex) | self.every_sample_receives

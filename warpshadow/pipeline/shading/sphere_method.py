@@ -270,8 +270,8 @@ class PortionedVisibility(Node):
     """Visibility of receivers, found group by group and portion by portion; classes below add steps.
 
     Each step is a function of the method. The value is a list of the results of all portions. Without a gradient,
-    one portion's transfer vectors are in memory at a time; all of them only where they are the result: in free light,
-    or where bounces cache visibility since colors vary. Receivers with cached rows are one portion.
+    known light is shaded portion by portion, and each portion's transfer vectors are dropped after it. They are kept
+    for free light, and where bounces reuse them. Receivers with cached rows are one portion.
 
     Args:
         method: How light is blocked.

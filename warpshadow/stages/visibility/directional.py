@@ -197,7 +197,7 @@ def _make_transmit_adjoint(has_horizon: bool, has_footprints: bool, lanes: int) 
 
     @wp.func(inline=True)
     def find_weight(sphere_view: SphereView, task: TransmittanceTask):
-        """None counts more than another."""
+        """All spheres have weight 1."""
         return Lane(1.0)
 
     @wp.func(inline=True)
