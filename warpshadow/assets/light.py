@@ -184,7 +184,7 @@ class EnvironmentMap:
         return self
 
     def coarsened(self, row_count: int) -> EnvironmentMap:
-        """Reduce the map to that many rows, each pixel the mean of those that it covers, by solid angle.
+        """Reduce the map to that many rows; each pixel is the mean of the pixels that it covers, by solid angle.
 
         One of fewer rows, or not of a multiple of them, stays as it is.
         """

@@ -86,7 +86,7 @@ class OwnBody:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Receivers whose light the same blockers block: of all bodies, all but their own, or those that move."""
+    """Receivers that share their blockers: all bodies, all but their own, or the moving ones."""
 
     points: wp.array  # [batch, receiver] vec3
     normals: wp.array  # [batch, receiver] vec3

@@ -113,11 +113,11 @@ class LitPoints:
         return self._cached.get(name, (None, None))[1]
 
     def cached_of_bodies(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
-        """The same of a value that is equal for all points among the same bodies."""
+        """A cached value that all points among the same bodies share."""
         return _cached(self._cached_of_bodies, name, key, make)
 
     def with_receivers(self: Points, receivers: Node) -> Points:
-        """Other receivers, of which nothing is cached, among the same blockers, any of which may move."""
+        """Copy with other receivers, without cached values; any of the blockers may move."""
         points = copy.copy(self)
         points.receivers_node, points.static_bodies, points.is_scene_view = receivers, None, False
         points._cached = {}

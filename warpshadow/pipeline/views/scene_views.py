@@ -106,7 +106,7 @@ class SceneViews:
             self.last = (view, self.last[1]) if self._is_of_scene(view) else (self.last[0], view)
 
     def lazy_view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
-        """Build a view of which nothing is computed yet, or reuse a cached one if its inputs match."""
+        """Build a view, and compute nothing of it, or reuse a cached one if its inputs match."""
         vertices, spheres, cameras, static_bodies = self.vertices, self._spheres, self.clip_matrices, None
         last, poses, matrices = self.last[1], [None], self._cameras
         if geometry is not None:
