@@ -74,6 +74,9 @@ BANNED_PARTS = {"asked", "kept", "meant", "most", "pull", "pulled", "said", "tak
 or it follows one."""
 
 FIRST_WORDS = ("Those ", "That which ", "Whatever ")
+WITHOUT_SUBJECT = re.compile(
+    r"^(the same|these|others?)\b|\b(of which|those that|those which|likewise)\b", re.IGNORECASE
+)
 WHAT = re.compile(r"\bwhat\b", re.IGNORECASE)
 
 
@@ -200,6 +203,12 @@ def test_no_docstring_or_message_has_what_in_place_of_a_noun():
     nodes = [(path, node) for path, tree in trees() for node in ast.walk(tree) if isinstance(node, ast.Constant)]
     texts += [(f"{path}:{node.lineno}", node.value) for path, node in nodes if isinstance(node.value, str)]
     assert not [f"{place}: {text[:60]}" for place, text in texts if text.startswith(FIRST_WORDS) or WHAT.search(text)]
+
+
+def test_the_first_line_of_a_docstring_names_its_subject():
+    """So that it can be read by itself, in lists of functions: "the same" as which, and "those" of what?"""
+    lines = [(path, text.partition("\n")[0], line) for path, tree in trees() for text, line in docstrings(tree)]
+    assert not [f"{path}:{line}: {text}" for path, text, line in lines if WITHOUT_SUBJECT.search(text)]
 
 
 def test_names_of_tests_are_sentences():

@@ -217,7 +217,8 @@ def resolved(path):
 
 
 SOURCES = {file: file.read_text("utf-8") for file in sorted((ROOT / "warpshadow").rglob("*.py"))}
-DEFINED = {name for file in SOURCES for name in (file.stem, file.parent.name)} | {
+MODULES = {name for file in SOURCES for name in (file.stem, file.parent.name)}
+DEFINED = MODULES | {
     getattr(node, key)
     for text in SOURCES.values()
     for node in ast.walk(ast.parse(text))
@@ -265,6 +266,8 @@ def test_names_that_docstrings_refer_to_exist(file):
         else:
             parts = path.strip(".").split(".")
             assert DEFINED.issuperset(parts) and not unknown_members(parts), path
+            if role == "mod":
+                assert MODULES.issuperset(parts), path
 
 
 @each_page_of_today

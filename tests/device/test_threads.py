@@ -2,13 +2,14 @@
 
 import contextlib
 import copy
+import functools
 import multiprocessing
 import os
 import pickle
 import subprocess
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ import warp as wp
 from tensors import small_scene
 
 import warpshadow as ws
-from warpshadow.device import tape
+from warpshadow.device import tape, threads
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.device.warp_internals import current_tape
 from warpshadow.torch import TorchRenderer, apply
@@ -237,6 +238,45 @@ def test_one_at_a_time_means_that_no_two_run_at_once():
         for future in [pool.submit(step) for _ in range(8)]:
             future.result()
     assert len(most) == 8 and max(most) == 1
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda renderer: renderer.warp.scene_poses(pivot="center"),
+        lambda renderer: renderer.warp.clip_matrices,
+        lambda renderer: renderer.warp.on_faces(np.zeros(1, int), np.full((1, 3), 1 / 3)),
+        lambda renderer: renderer.scene_poses(pivot="center"),
+        lambda renderer: renderer(),
+    ],
+    ids=["scene_poses", "clip_matrices", "on_faces", "torch", "image"],
+)
+def test_calls_wait_for_the_call_of_another_thread(call):
+    renderer = TorchRenderer(small_scene("none", size=4))
+    with ThreadPoolExecutor(1) as pool:
+        with threads.one_call:
+            future = pool.submit(call, renderer)
+            assert not wait([future], 0.2).done
+        future.result(60)
+
+
+def test_a_call_of_a_renderer_takes_the_lock_once(monkeypatch):
+    renderer, entries = ws.Renderer(small_scene("none", size=4)), []
+    geometry = renderer.placed()
+    renderer.draw(geometry=geometry)
+
+    class Counting:
+        def __enter__(self):
+            entries.append(None)
+
+        def __exit__(self, *_):
+            pass
+
+    monkeypatch.setattr(threads, "one_call", Counting())
+    for call in (renderer.draw, renderer.explain, functools.partial(renderer.draw, geometry=geometry), renderer.placed):
+        entries.clear()
+        call()
+        assert len(entries) == 1
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from tensors import random, small_scene
 from torch.nn.utils.rnn import pad_sequence
 
 import warpshadow as ws
+from warpshadow.pipeline.image_inputs import ImageInputs
 from warpshadow.torch import MixedRenderer, TorchRenderer
 
 SIZE = 8
@@ -273,3 +274,41 @@ def test_each_image_may_have_a_shell_of_its_own():
     assert_images(images, expected)
     images.square().sum().backward()
     assert shells.grad.any(dim=1).all()
+
+
+@pytest.fixture(scope="module")
+def of_all_inputs() -> tuple[TorchRenderer, MixedRenderer]:
+    """A renderer of a scene that takes every input of an image, and one of that scene alone."""
+    ball, ground = small_scene(size=SIZE).bodies
+    ball = dataclasses.replace(ball, roughness=0.4)
+    lamp = ws.Body(ws.plane(0.5), translation=(0, 3, 0), rotation=(180, 0, 0), emission=(2, 2, 2), name="lamp")
+    light = ws.EnvironmentMap(np.random.default_rng(0).random((4, 8, 3), np.float32), radius=5.0)
+    scene = dataclasses.replace(small_scene("none", size=SIZE), bodies=(ball, ground, lamp), light=light)
+    renderer = TorchRenderer(scene)
+    return renderer, MixedRenderer([renderer])
+
+
+OTHER_INPUTS = {
+    "light": lambda renderer: random(renderer.basis.size, 3).detach(),
+    "albedo": lambda _: {0: torch.tensor([0.1, 0.2, 0.9])},
+    "textures": lambda _: {1: torch.full((2, 2, 3), 0.1)},
+    "emission": lambda _: {"lamp": torch.tensor([9.0, 1.0, 1.0])},
+    "roughness": lambda _: {0: torch.tensor(0.9)},
+    "metallic": lambda _: {0: torch.tensor(1.0)},
+    "specular": lambda _: {0: torch.tensor(0.0)},
+    "shell": lambda _: torch.tensor([0.0, 0.0, 1.0, 7.0]),
+    "geometry": lambda renderer: renderer.placed(renderer.scene_poses()[0], renderer.scene_poses()[1] + 0.2),
+    "clip_matrices": lambda renderer: renderer.clip_matrices(
+        *(item + (0.3 if item.ndim == 1 else 0) for item in renderer.scene_cameras())
+    ),
+}
+"""Values other than those of the scene, by the names of the fields of ImageInputs."""
+
+
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(ImageInputs)])
+def test_every_input_of_an_image_arrives(of_all_inputs, name):
+    renderer, mixed = of_all_inputs
+    value = OTHER_INPUTS[name](renderer)
+    image = renderer(**{name: value})
+    assert not torch.equal(image, renderer())
+    assert torch.equal(mixed([0], **{name: [value] if name == "geometry" else value})[0], image)

@@ -9,7 +9,7 @@ from warpshadow import check
 from warpshadow.assets.cells import spread_in_cells
 from warpshadow.assets.harmonic_light import HarmonicLight
 from warpshadow.assets.known_light import as_light
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.light import EnvironmentMap, KnownLightArgument
 from warpshadow.maths import sh
 from warpshadow.maths.directions import CHUNK, fibonacci
 
@@ -41,7 +41,7 @@ class HarmonicBasis:
         """Evaluate the basis functions at unit vectors [direction, 3]: shape [direction, coefficient]."""
         return sh.evaluate(self.order, directions)
 
-    def coefficients(self, light: EnvironmentMap | np.ndarray) -> np.ndarray:
+    def coefficients(self, light: KnownLightArgument) -> np.ndarray:
         """Express a map, or SH coefficients of any order [order², 3], in the basis: float32 [coefficient, 3]."""
         return as_light(light).sh(self.order).copy()
 
@@ -109,7 +109,7 @@ class CellBasis:
         nearest: np.ndarray = cKDTree(self.directions).query(directions)[1]
         return nearest
 
-    def coefficients(self, light: EnvironmentMap | np.ndarray) -> np.ndarray:
+    def coefficients(self, light: KnownLightArgument) -> np.ndarray:
         """Express a map, or SH coefficients of any order [order², 3], in the basis: float32 [coefficient, 3]."""
         return as_light(light).cells(self.directions).radiance.copy()
 

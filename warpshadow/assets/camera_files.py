@@ -75,7 +75,7 @@ def _read_transforms(path: Path, size: tuple[int, int] | None, near: float) -> d
 
 
 def _image_path(image: Path) -> Path:
-    """The path of an image, of which the Blender scenes leave out ".png"."""
+    """The path of an image; files of the Blender scenes leave out ".png"."""
     return image if image.suffix else image.with_name(f"{image.name}.png")
 
 

@@ -95,7 +95,7 @@ def _cell_integrals(
 
 
 def spread_in_cells(radiance: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Make a map of even cells around directions, of which :func:`gather_cells` gathers the same radiance again.
+    """Make a map of even cells around directions; :func:`gather_cells` gathers their radiance from it again.
 
     Args:
         radiance: Mean radiance L_q, as in a :class:`CellLight`; shape [direction, 3].

@@ -53,7 +53,7 @@ class HarmonicLight:
         return self.coefficients
 
     def coarsened(self, row_count: int) -> HarmonicLight:
-        """The same: as a map of few rows it is as smooth."""
+        """The light itself, which is as smooth as a map of few rows."""
         return self
 
     def towards(self, directions: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from warpshadow.assets.cells import CellLight
 from warpshadow.assets.harmonic_light import HarmonicLight
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.light import KnownLightArgument
 
 
 class KnownLight(Protocol):
@@ -23,7 +23,7 @@ class KnownLight(Protocol):
         """Center and radius of the sphere that sends it, float32 of shape [4]; None for light infinitely far away."""
 
     @property
-    def as_argument(self) -> EnvironmentMap | np.ndarray:
+    def as_argument(self) -> KnownLightArgument:
         """The light as scenes and renderers take it."""
 
     def towards(self, directions: np.ndarray) -> np.ndarray:
@@ -48,6 +48,6 @@ class KnownLight(Protocol):
         """The light in cells around directions [cell, 3]."""
 
 
-def as_light(light: EnvironmentMap | np.ndarray) -> KnownLight:
+def as_light(light: KnownLightArgument) -> KnownLight:
     """The light of a user with its methods: a map as it is, SH coefficients [order², 3] as :class:`HarmonicLight`."""
     return HarmonicLight(light) if isinstance(light, np.ndarray) else light

@@ -14,6 +14,7 @@ import hashlib
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -183,7 +184,7 @@ class EnvironmentMap:
         return self
 
     def coarsened(self, row_count: int) -> EnvironmentMap:
-        """Reduce the map to that many rows, each pixel the mean of those that it covers, by solid angle.
+        """Reduce the map to that many rows; each pixel is the mean of the pixels that it covers, by solid angle.
 
         One of fewer rows, or not of a multiple of them, stays as it is.
         """
@@ -405,3 +406,7 @@ def _sums_around(image: np.ndarray) -> np.ndarray:
     row_sums = image + np.roll(image, 1, axis=1) + np.roll(image, -1, axis=1)
     padded_sums = np.pad(row_sums, ((1, 1), (0, 0), (0, 0)))
     return padded_sums[:-2] + padded_sums[1:-1] + padded_sums[2:]
+
+
+KnownLightArgument: TypeAlias = EnvironmentMap | np.ndarray
+"""A known light as scenes and renderers take it: a map, or SH coefficients [order², 3]."""

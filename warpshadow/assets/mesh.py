@@ -177,7 +177,7 @@ class Mesh:
 
     @functools.cached_property
     def convex_parts(self) -> list[ConvexPart]:
-        """The convex solids and panels of cloth of which it consists; empty where it has anything else."""
+        """Its convex solids and panels of cloth; empty if other faces remain."""
         return find_convex_parts(self.positions, self.surface.faces) or []
 
     @functools.cached_property
@@ -188,7 +188,7 @@ class Mesh:
 
     @functools.cached_property
     def flat_parts(self) -> list[ConvexPart]:
-        """The convex solids and flat panels of which it consists; empty where it has anything else."""
+        """Its convex solids and flat panels; empty if other faces remain."""
         return find_convex_parts(self.positions, self.surface.faces, flat_panels=True) or []
 
     def transformed(

@@ -282,7 +282,7 @@ def _scramble(numbers: np.ndarray) -> np.ndarray:
 
 
 def join_faces(positions: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None) -> MeshTopology:
-    """Join faces of which none is listed twice."""
+    """Join lists of different faces."""
     position_ids = number_positions(positions)[faces]
     neighbors = edge_neighbors(position_ids)
     # of the edges opposite to corners

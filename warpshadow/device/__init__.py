@@ -1,1 +1,1 @@
-"""Kernel launches: the tape, slices on all cores, lanes, batches, constants, CUDA graphs."""
+"""Kernel launches: tape, slices on all cores, lanes, batches, CUDA graphs; threads, worker processes, progress."""

@@ -129,7 +129,7 @@ def compiler_flags(lanes: int) -> str:
 
 @functools.cache
 def _accepted_flags(base: str, flags: tuple[str, ...]) -> str:
-    """Join flags, without the ones that the compiler refuses, of which a warning tells."""
+    """Join flags, and leave out flags that the compiler refuses, with a warning."""
     if _builds(" ".join((base, *flags))):
         return " ".join((base, *flags))
     refused_flags = [flag for flag in flags if not _builds(f"{base} {flag}")]

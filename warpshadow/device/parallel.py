@@ -1,8 +1,8 @@
 """All cores: kernels that take long on a CPU run in slices, on threads of a pool.
 
 Warp runs a CPU kernel on the thread that launches it, one item after another. It calls the kernel through ctypes, which
-lets go of Python's lock; so the rows of a launch are cut into slices that several threads run at once. The first two
-arguments of a kernel serve this:
+lets go of Python's lock; so the rows of a launch are cut into slices that several threads run at once. A kernel that
+is launched with a cost has two arguments for this, before all others:
 
     first_row   the slice's first row, to which it adds the row that Warp tells it
     worker      which thread runs it, so which scratch memory is its own; -1 on a GPU, where each row has some

@@ -279,7 +279,7 @@ _module_numbers = itertools.count(1)
 
 
 def _compiling() -> contextlib.AbstractContextManager:
-    """Say that kernels are compiled, and of which module of this process."""
+    """Say that kernels are compiled, and the number of their module in this process."""
     return progress_bar(
         None, f"compiling kernels, module {next(_module_numbers)}", "", shows=not _this_thread.is_hidden
     )

@@ -25,7 +25,7 @@ if hasattr(os, "register_at_fork"):  # a child would wait for ever for a thread 
 
 
 def one_at_a_time(function: Callable[P, R]) -> Callable[P, R]:
-    """Make a function that waits until no other thread is in one of these."""
+    """Hold the lock during a function, so that no two threads run such functions at once."""
 
     @functools.wraps(function)
     def alone(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -36,14 +36,16 @@ def one_at_a_time(function: Callable[P, R]) -> Callable[P, R]:
 
 
 class _HasProgress(Protocol):
-    progress: bool
+    @property
+    def progress(self) -> bool:
+        """Whether it shows its progress."""
 
 
 Shown = TypeVar("Shown", bound=_HasProgress)
 
 
 def announced(function: Callable[Concatenate[Shown, P], R]) -> Callable[Concatenate[Shown, P], R]:
-    """Make a method one of a call at a time that says in files that it runs, should that take long."""
+    """Hold the lock during a method, and print progress lines if it takes long and output goes to a file."""
 
     @one_at_a_time
     @functools.wraps(function)

@@ -336,7 +336,7 @@ def array_at(pointer: int, shape: Sequence[int], dtype: type, *, owner: Any) -> 
 
 
 def contiguous_view(array: wp.array, shape: Sequence[int], dtype: type, *, first: int = 0) -> wp.array | None:
-    """View contiguous memory of a CPU array, from a byte on, in another shape or dtype, and its gradient likewise.
+    """View contiguous memory of a CPU array, and of its gradient, from a byte on, in another shape or dtype.
 
     None where Warp is to do it: of arrays on a GPU, and of such that are not contiguous or empty.
     """
@@ -376,7 +376,7 @@ def scalar_type(dtype: type) -> type:
 
 
 def viewed_array(array: wp.array) -> wp.array | None:
-    """The array of which one is a part, or another shape; None where it is neither."""
+    """The array that another views, as a part of it or in another shape; None for an array with memory of its own."""
     return getattr(array, "_ref", None)
 
 

@@ -62,7 +62,7 @@ class ResponseCurve:
 
     @staticmethod
     def read(path: AnyPath) -> ResponseCurve:
-        """Read the samples from a .csv file; a first line may name the columns, of which the last is "value"."""
+        """Read the samples from a .csv file; a first line may name the columns, the last "value"."""
         path = check.file("encoding", path)
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
         rows = [[cell.strip() for cell in line.split(",")] for line in lines if line.strip() and line[0] != "#"]

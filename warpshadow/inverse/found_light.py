@@ -18,7 +18,7 @@ import torch
 from warpshadow.assets.basis import CellBasis
 from warpshadow.assets.color import auto_exposure
 from warpshadow.assets.known_light import as_light
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.light import KnownLightArgument
 from warpshadow.assets.picture import Picture
 from warpshadow.inverse.diagnostics import small_stage
 from warpshadow.inverse.free.base import Values
@@ -82,7 +82,7 @@ class FoundLight:
 
 
 def found_light(
-    light: EnvironmentMap | np.ndarray, problem: Problem, setting: Setting, values: Mapping[str, Values]
+    light: KnownLightArgument, problem: Problem, setting: Setting, values: Mapping[str, Values]
 ) -> FoundLight:
     """The light of a fit, and which part of it the images determine."""
     radiance = as_light(light).radiance

@@ -123,7 +123,7 @@ class LightModel(Model):
         return is_light and is_plain and problem.loss.kind == "l2"
 
     def _images_of_units(self) -> list[torch.Tensor]:
-        """Images in light of which one coefficient is 1, [view, height, width, 4] each."""
+        """Images by lights with one coefficient of 1 each, [view, height, width, 4]."""
         units = torch.eye(self.light.basis.size, device=self.setting.device)[..., None].expand(-1, -1, 3).contiguous()
         if len(self.cameras) > 1:
             return [self.renderer(unit) for unit in units]

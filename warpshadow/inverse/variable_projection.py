@@ -140,7 +140,7 @@ class ProjectedModel(Model):
 
 
 def atoms(light: Light) -> np.ndarray:
-    """Lights of which sums with no negative parts are searched, in coefficients, float64 [atom, coefficient]."""
+    """Lights whose nonnegative sums are searched, in coefficients, float64 [atom, coefficient]."""
     if isinstance(light.basis, CellBasis):
         return np.eye(light.basis.size)
     return light.basis.functions(fibonacci(_ATOMS)).astype(np.float64) * (4 * np.pi / _ATOMS)

@@ -1,1 +1,1 @@
-"""Mathematics in NumPy: spherical harmonics, directions and their cells, spatial sorting."""
+"""Mathematics in NumPy and SciPy: shapes of meshes, spherical harmonics, directions and their cells, sorting."""

@@ -61,7 +61,7 @@ def is_panel(part: ConvexPart) -> bool:
 def find_convex_parts(
     positions: np.ndarray, faces: np.ndarray, *, flat_panels: bool = False
 ) -> list[ConvexPart] | None:
-    """Find the convex parts of which a mesh consists.
+    """Cut a mesh into convex parts.
 
     Args:
         positions: Vertices, shape [vertex, 3]; vertices at one place count as one.
@@ -132,7 +132,7 @@ def _pieces(triangles: np.ndarray) -> np.ndarray:
 
 
 def _groups(sheets: list[np.ndarray]) -> np.ndarray:
-    """Number of the group of each sheet, of those that share edges, such as walls that meet in a T."""
+    """Number of the group of each sheet; sheets that share edges, such as walls that meet in a T, are one group."""
     edges, none = [np.unique(np.sort(edges_of(sheet), axis=1), axis=0) for sheet in sheets], np.zeros((0, 2), int)
     sheet = np.repeat(np.arange(len(sheets)), list(map(len, edges)))
     _, edge = np.unique(np.concatenate([none, *edges]), axis=0, return_inverse=True)

@@ -19,7 +19,7 @@ bowl of a thin wall, 128² pixels, light is off by 2.2% with 0.02 (131 panels), 
 corners at its foot with more than 0.007. A bunny would have 190 with 0.04, and has spheres."""
 
 MAX_FLAT_PANELS_OF = {1e-3: 64}
-"""The same for flat panels, which shade nothing that lies on the mesh."""
+"""Deviation and number for flat panels, which shade nothing that lies on the mesh."""
 
 _MAX_SCALE = 2.0
 """Scale of a sheet over its extent at most. The scale is the geometric mean of the extents of the sheet and the mesh:

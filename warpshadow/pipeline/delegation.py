@@ -1,16 +1,19 @@
-"""Methods of an object that one of its parts does."""
+"""Methods of a renderer that one of its parts does."""
 
 import functools
 from collections.abc import Callable
 from typing import Any, Concatenate, ParamSpec, TypeVar
+
+from warpshadow.device.threads import one_at_a_time
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 def delegated(part: str, function: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Any, P], R]:
-    """Make a method of a part one of the object that has the part."""
+    """Make a method of a part one of the renderer that has the part; it waits until no other thread is in a call."""
 
+    @one_at_a_time
     @functools.wraps(function)
     def called(self: Any, *args: P.args, **kwargs: P.kwargs) -> R:
         return function(getattr(self, part), *args, **kwargs)

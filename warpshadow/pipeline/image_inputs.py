@@ -7,20 +7,21 @@ import re
 import textwrap
 import typing
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar, overload
 
-import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.light import KnownLightArgument
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.scene.material import INPUTS_OF_BODIES
 from warpshadow.scene.scene import PerBody
 
 Array = TypeVar("Array")  # Warp's arrays, or tensors
 Placed = TypeVar("Placed")  # a geometry of these; of a renderer of several scenes one for each
+
+_DIMENSIONS = "dimensions of an item"
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,7 @@ class ImageInputs(Generic[Array, Placed]):
             TorchRenderer's ``clip_matrices``; by default the renderer's own.
     """
 
-    light: Array | EnvironmentMap | np.ndarray | None = None
+    light: Array | KnownLightArgument | None = field(default=None, metadata={_DIMENSIONS: 2})
     _: KW_ONLY
     albedo: PerBody[Array] | None = None
     textures: PerBody[Array] | None = None
@@ -63,9 +64,9 @@ class ImageInputs(Generic[Array, Placed]):
     roughness: PerBody[Array] | None = None
     metallic: PerBody[Array] | None = None
     specular: PerBody[Array] | None = None
-    shell: Array | None = None
+    shell: Array | None = field(default=None, metadata={_DIMENSIONS: 1})
     geometry: Placed | None = None
-    clip_matrices: Array | None = None
+    clip_matrices: Array | None = field(default=None, metadata={_DIMENSIONS: 2})
 
     def __post_init__(self) -> None:
         items = self.light if isinstance(self.light, (tuple, list)) else [self.light]
@@ -76,6 +77,12 @@ class ImageInputs(Generic[Array, Placed]):
     def of_bodies(self) -> dict[str, PerBody[Array] | None]:
         """The materials of bodies, by name."""
         return {name: getattr(self, name) for name in INPUTS_OF_BODIES}
+
+    @property
+    def of_images(self) -> dict[str, tuple[Any, int]]:
+        """All others but the geometry, by name, and how many dimensions an item of their tensors has."""
+        others = (part for part in dataclasses.fields(self) if part.name not in (*INPUTS_OF_BODIES, "geometry"))
+        return {part.name: (getattr(self, part.name), part.metadata[_DIMENSIONS]) for part in others}
 
 
 ImageArrays = ImageInputs[wp.array, Geometry[wp.array]]
@@ -107,7 +114,7 @@ def takes(record: Callable[P, Inputs_co], **remedies: str) -> _Taking[P, Inputs_
     """
     kind: Any = typing.get_origin(record) or record
     types = _field_types(record)
-    fields = [field.replace(annotation=types[name]) for name, field in inspect.signature(kind).parameters.items()]
+    fields = [part.replace(annotation=types[name]) for name, part in inspect.signature(kind).parameters.items()]
     classes = [base for base in reversed(kind.__mro__) if dataclasses.is_dataclass(base)]
     documentation = "\n".join((inspect.getdoc(base) or "").partition("Args:\n")[2] for base in classes)
     entries = textwrap.indent(documentation, 8 * " ")

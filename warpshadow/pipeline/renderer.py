@@ -14,7 +14,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.basis import Basis, check_basis
 from warpshadow.assets.camera import Camera
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.light import KnownLightArgument
 from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
@@ -78,6 +78,9 @@ class SceneRenderer:
         cameras: The cameras of the scene.
         has_camera_batch: Whether they were given as a batch.
         basis: Basis of free light.
+        device: Device of its arrays.
+        progress: Whether it shows its progress.
+        merged_scene: The bodies as one mesh.
         clock: How long stages took; with ``clock.waits``, stages on a GPU are waited for.
 
     Threads may share it: their calls come one after another. Copied or pickled, it takes along its arguments, and the
@@ -174,6 +177,7 @@ class SceneRenderer:
     deformation_graph = delegated("_free_shapes", FreeShapes.deformation_graph)
 
     @property
+    @one_at_a_time
     def clip_matrices(self) -> wp.array:
         """The cameras, mat44 of shape [camera]."""
         return self._views.clip_matrices.value()
@@ -193,7 +197,7 @@ class SceneRenderer:
                 :func:`warpshadow.stages.raster.project.compose_clip_matrices`.
         Differentiable: geometry, clip_matrices.
         """
-        return self._views.view(None if geometry is None else as_geometry("geometry", geometry), clip_matrices)
+        return self._views.view(geometry, clip_matrices)
 
     at_points = delegated("_views", SceneViews.at_points)
     on_faces = delegated("_views", SceneViews.on_faces)
@@ -201,7 +205,7 @@ class SceneRenderer:
     @functools.cached_property
     def _scene_view(self) -> View:
         """Build the view of the cameras on the scene; a warning tells of coarse faces."""
-        view = self.view()
+        view = self._views.view()
         if not self.scene.visibility.traits.every_sample_receives:
             warn_of_vertex_receivers(view, self._given_scene.bodies, self.cameras[0])
         return view
@@ -304,7 +308,7 @@ class SceneRenderer:
     # ------------------------------------------------------------------------------------------ image
 
     @takes(ViewArrays)
-    @one_at_a_time
+    @announced
     def draw(self, inputs: ViewArrays) -> wp.array:
         """Draw images.
 
@@ -317,15 +321,17 @@ class SceneRenderer:
         is_of_scene = inputs.view is None and inputs.geometry is None and inputs.clip_matrices is None
         return self.draw_inputs(inputs, self._scene_view if is_of_scene else inputs.view)  # the former warns
 
-    @announced
     def draw_inputs(self, inputs: ImageArrays, view: View | None = None) -> wp.array:
-        """Draw images, as :meth:`draw` does, by a record of its arguments; it does not warn of coarse faces."""
-        view = self.view(inputs.geometry, inputs.clip_matrices) if view is None else self._checked(view)
+        """Draw images, as :meth:`draw` does, by a record of its arguments; it does not warn of coarse faces.
+
+        This and its like take no lock, which their callers hold.
+        """
+        view = self._views.view(inputs.geometry, inputs.clip_matrices) if view is None else self._checked(view)
         light = self._method.light_input(view, inputs.light, inputs.shell)
         return view.image(light, self.materials(inputs.of_bodies)).value(self._views.call(view))
 
     @check.keywords(**dict.fromkeys(("camera", "cameras"), "renderer.with_cameras([camera]).render()"))
-    def render(self, light: EnvironmentMap | np.ndarray | None = None) -> np.ndarray:
+    def render(self, light: KnownLightArgument | None = None) -> np.ndarray:
         """Render the image of the scene.
 
         Args:
@@ -344,6 +350,7 @@ class SceneRenderer:
         return images if self.has_camera_batch else images[0]
 
     @takes(ImageArrays)
+    @announced
     def insert(self, photograph: wp.array | None, inputs: ImageArrays) -> wp.array:
         """Draw images of the bodies in a photograph whose surfaces the shadow catchers model.
 
@@ -360,7 +367,6 @@ class SceneRenderer:
         """
         return self.insert_inputs(photograph, inputs)
 
-    @announced
     def insert_inputs(self, photograph: wp.array | None, inputs: ImageArrays) -> wp.array:
         """Draw images in a photograph, as :meth:`insert` does, by a record of its arguments."""
         if not self.scene.catchers:
@@ -376,7 +382,7 @@ class SceneRenderer:
             geometry = as_geometry("geometry", inputs.geometry)
             alone = catchers.moved_geometry(geometry)
             geometry = replace(geometry, moving=None)  # else static catchers would be lit in another way than alone
-        view = self.view(geometry, inputs.clip_matrices)
+        view = self._views.view(geometry, inputs.clip_matrices)
         light = self._method.light_input(view, inputs.light, inputs.shell)
         of_catchers = catchers.light(replace(inputs, geometry=alone), view)
         unshadowed = Input("light without the others", of_catchers)
@@ -449,6 +455,7 @@ class SceneRenderer:
     # ------------------------------------------------------------------------------------------ explanation
 
     @takes(ViewArrays)
+    @one_at_a_time
     def explain(self, inputs: ViewArrays) -> Explanation:
         """List the stages that the next call computes and skips, and why.
 
@@ -461,7 +468,6 @@ class SceneRenderer:
         """
         return self.explain_inputs(inputs, inputs.view)
 
-    @one_at_a_time
     def explain_inputs(self, inputs: ImageArrays, view: View | None = None) -> Explanation:
         """List stages, as :meth:`explain` does, by a record of its arguments."""
         hidden: set[Node] = set()
@@ -469,8 +475,7 @@ class SceneRenderer:
             view = self._checked(view)
             hidden = {*decide_which_nodes_run(view.receivers_node, view.call), view.silhouettes}
         else:
-            geometry = None if inputs.geometry is None else as_geometry("geometry", inputs.geometry)
-            view = self._views.lazy_view(geometry, inputs.clip_matrices)
+            view = self._views.lazy_view(inputs.geometry, inputs.clip_matrices)
         preview = view.preview()  # which the nodes' words ask, so it stays meanwhile
         light = self._method.light_input(preview, inputs.light, inputs.shell)
         materials = self.materials(inputs.of_bodies)

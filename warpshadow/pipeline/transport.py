@@ -89,7 +89,7 @@ class LightTransport:
     def shading_without_emitters(
         self, points: LitPoints, light: LightInput, materials: Materials | None = None
     ) -> Node:
-        """The same without direct light of emitters, but with that which bounces."""
+        """Light that white points reflect, without direct light of emitters, but with their bounced light."""
         if not self.method.merged_scene.scene.bounces:
             return self.method.direct_shading(points, light)
         materials = materials or points.materials

@@ -126,7 +126,7 @@ def _convex_parts(scene: Scene) -> dict[int, list[ConvexPart]]:
 
 
 def find_solids(scene: Scene, parts: Mapping[int, Sequence[ConvexPart]]) -> frozenset[int]:
-    """Find the bodies whose convex parts block their own light, too: those that consist of solids alone.
+    """Find the bodies whose convex parts block their own light, too: bodies of solids alone.
 
     Panels are chords of bent sheets, in which receivers do not lie; and rays to a sun may be asked for.
     """
@@ -147,7 +147,7 @@ def fitted_counts(scene: Scene) -> dict[int, int | str]:
 
 
 def _fitted_counts(scene: Scene, parts: dict[int, list[ConvexPart]]) -> dict[int, int | str]:
-    """The same, of a scene whose convex parts are known."""
+    """Find the bodies to which spheres are fitted, given the convex parts of the scene."""
     grounds = _ground_spheres(scene)
     counts = [
         SPHERES_BESIDE_PARTS if number in parts else _requested_count(body) for number, body in enumerate(scene.bodies)

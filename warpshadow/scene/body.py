@@ -54,8 +54,8 @@ class Body:
         blockers: Number of spheres to fit to the mesh, or "auto" for as many as it needs, 8 to 1024
             (:func:`warpshadow.fit_spheres`), or the spheres themselves, or an .npz file of them; 0 or none casts no
             shadow, by rays neither. Flat bodies, and with "auto" convex pieces and cloth, may block by their own shape
-            instead: "Blockers" in scene/README.md says which. Where light bounces, a body of 0 or none is lit and
-            reflects all the same, and takes its light from nobody; "Bounces" in pipeline/README.md says onto which.
+            instead: "Blockers" in scene/README.md says which. Where light bounces, a body without blockers is lit and
+            blocks no bounced light either; "Bounces" in pipeline/README.md says onto which bodies it reflects.
         rotation: Axis-angle vector [degrees], shape [3]: (0, 90, 0) is a quarter turn about +y, through the origin of
             the mesh's own space, wherever its vertices are; :meth:`on_ground` then stands the body where it is to
             stand, and :meth:`Renderer.placed` can turn it about its middle. A matrix, shape [3, 3], becomes such a

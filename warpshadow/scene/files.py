@@ -17,7 +17,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.camera_conventions import HALF_PIXEL
 from warpshadow.assets.image import write_image
 from warpshadow.assets.known_light import as_light
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.light import EnvironmentMap, KnownLightArgument
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.mesh_files import MESH_SUFFIXES
 from warpshadow.assets.primitives import icosphere, infinite_ground, plane
@@ -168,7 +168,7 @@ def parse_camera(table: Table) -> Camera:
     return toml_tables.make(Camera, arguments)
 
 
-def _light(table: Table, folder: Path) -> EnvironmentMap | np.ndarray:
+def _light(table: Table, folder: Path) -> KnownLightArgument:
     toml_tables.check_table(table)
     _check_keys("[light]", table)
     if sum(key in table for key in ("envmap", "sky", "sh")) != 1:
@@ -203,7 +203,7 @@ def _with_sun(envmap: EnvironmentMap, table: Table) -> EnvironmentMap:
         return toml_tables.make(envmap.with_sun, table["sun"])
 
 
-def turned_light(light: EnvironmentMap | np.ndarray, rotation: float, scale: float) -> EnvironmentMap | np.ndarray:
+def turned_light(light: KnownLightArgument, rotation: float, scale: float) -> KnownLightArgument:
     """Light as the keys ``rotation`` [degrees about +y] and ``scale`` make it of a map or of SH coefficients."""
     changed = as_light(light)
     changed = changed.rotated(rotation) if rotation else changed
@@ -301,7 +301,7 @@ def write_scene(scene: Scene, folder: AnyPath, *, stems: Sequence[str] | None = 
     return [path, *written]
 
 
-def _write_light(light: EnvironmentMap | np.ndarray, folder: Path) -> tuple[Table, list[Path]]:
+def _write_light(light: KnownLightArgument, folder: Path) -> tuple[Table, list[Path]]:
     """Write the file that the table of a light names, if it names one, and make the table, which ``_light`` reads."""
     if isinstance(light, np.ndarray):
         return {"sh": [_numbers(row) for row in light]}, []

@@ -22,7 +22,7 @@ gaps: with 1/16 the land of demos/kinds.py is 4.1% off, and a bottle on it 5% to
 _POINTS = 1024  # of meshes, from which rays tell which bodies lie before the field, and which behind
 
 _MIN_RATIO_BEFORE = 0.1
-"""Rays that meet a body before the field, over those that meet it behind: from this ratio on it sticks in the field.
+"""Ratio of rays that meet a body before the field to rays that meet it behind: from here on it sticks in the field.
 
 So do rocks and water in land; a ground that a tent stands on does not."""
 

@@ -12,7 +12,7 @@ class MaterialField(NamedTuple):
     """A number of a surface: of a body, of each vertex, or a texture [height, width]."""
 
     name: str  # of the field of a body, of the key of a scene file, and of the argument of a renderer
-    default: float  # of a body that does not say. A roughness makes a body shine; others need a number in arrays of all
+    default: float  # for bodies without the number; of roughness a filler in arrays, since such bodies are diffuse
     minimum: float = 0.0  # the range that is accepted
     maximum: float = 1.0
     is_in_files: bool = False  # whether materials of meshes' files have it, as glTF's do

@@ -93,7 +93,7 @@ def misplacements(scene: Scene) -> list[str]:
 
 
 def enclosures(scene: Scene, cameras: Iterable[Camera]) -> list[str]:
-    """Say of the first camera that is inside of a body of which one.
+    """Warn of the first camera inside a body, and name the body.
 
     A room whose walls face inwards, or are thick, does not enclose the bodies in it.
     """

@@ -158,7 +158,7 @@ class DrawnScene(NamedTuple):
     """A scene, and the random choices in it."""
 
     scene: Scene
-    """The bodies, of which the last one is the ground, light and camera."""
+    """The bodies, the last one the ground; light and camera."""
     prototypes: tuple[int, ...]
     """Which of the given bodies each is, from 0; that of the ground is left out."""
     light: DrawnLight | None
@@ -243,7 +243,7 @@ def _ground_size(bodies: Sequence[Body]) -> float:
 
 @functools.lru_cache(8)
 def _ground_mesh(size: float) -> Mesh:
-    """The same for all scenes, except wide ones, since renderers cache results by mesh."""
+    """Mesh of the ground: one for all scenes but wide ones, since renderers cache results by mesh."""
     return plane(size, 1)
 
 

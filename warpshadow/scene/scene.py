@@ -15,7 +15,7 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.image import ImageError
 from warpshadow.assets.known_light import KnownLight, as_light
-from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
+from warpshadow.assets.light import LIGHT, EnvironmentMap, KnownLightArgument, check_coefficients
 from warpshadow.assets.mesh import Mesh
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
@@ -171,7 +171,7 @@ class Scene:
     """
 
     bodies: tuple[Body, ...]
-    light: EnvironmentMap | np.ndarray
+    light: KnownLightArgument
     camera: Camera
     visibility: Visibility
     supersampling: int = 2

@@ -180,9 +180,9 @@ class Visibility:
         return cls(every.method, **{name: getattr(every, name) for name in every.traits.settings})
 
     def with_method(self) -> Visibility:
-        """The same by "directional" where no method is named, as renderers have it."""
+        """Copy with "directional" where no method is named, as renderers have it."""
         return self if self.method else self.by(DEFAULT_METHOD)
 
     def by(self, method: str) -> Visibility:
-        """The same by another method, with the settings that both read."""
+        """Copy for another method, with the settings that both read."""
         return Visibility.of(vars(self) | {"method": method})

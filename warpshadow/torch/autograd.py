@@ -113,7 +113,8 @@ def apply(
         dtypes: Warp's dtype of each.
         device: Where the function runs, by default the tensors' own; launched on torch's current stream there.
         names: Names of the tensors in messages, by default ``tensors[0]`` and so on.
-        affine: Names of tensors in each of which alone the function is affine.
+        affine: Names of the tensors in which the function is affine while all others are fixed: only gradients to
+            these can be differentiated again.
         find_capture: Finds the graphs that compute the call instead, if there are any (:mod:`.replay`).
     Returns:
         The array as a tensor, or a tuple of tensors for a tuple of arrays.

@@ -34,7 +34,7 @@ MixedTensors = ImageInputs[torch.Tensor, Sequence[Geometry[torch.Tensor] | None]
 
 
 class _Placed(list[Geometry[torch.Tensor] | None]):
-    """Geometries of scenes, and which scene each image was of when they were placed; None where all had one pose."""
+    """Geometries of the scenes; ``which`` as it was when they were placed, None if one pose serves all images."""
 
     which: tuple[int, ...] | None = None
 
@@ -99,10 +99,7 @@ class MixedRenderer(torch.nn.Module):
         Differentiable: all but which.
         """
         batch = _Batch(which, len(self.renderers))
-        whole_inputs = {
-            name: batch.split(name, getattr(inputs, name), ndim)
-            for name, ndim in (("light", 2), ("clip_matrices", 2), ("shell", 1))
-        }
+        whole_inputs = {name: batch.split(name, *entry) for name, entry in inputs.of_images.items()}
         of_bodies = {
             name: {
                 body: self._split_item(batch, name, body, tensor)

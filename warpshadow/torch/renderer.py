@@ -1,5 +1,6 @@
 """A renderer of one scene, whose arguments are tensors."""
 
+import dataclasses
 import functools
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -12,7 +13,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.basis import Basis, describe_coefficients
 from warpshadow.assets.camera import Camera
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import announced, one_at_a_time
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.bodies.geometry import GEOMETRY_DTYPES, Geometry, Pivot
 from warpshadow.pipeline.explain import Explanation
@@ -133,6 +134,11 @@ class TorchRenderer(torch.nn.Module):
         """Device of its tensors."""
         return torch.device(wp.device_to_torch(self.warp.device))
 
+    @property
+    def progress(self) -> bool:
+        """Whether it shows its progress."""
+        return self.warp.progress
+
     def _apply(self, fn: Callable[[torch.Tensor], torch.Tensor], recurse: bool = True) -> "TorchRenderer":
         """Go where a tensor would go: torch calls this for ``to``, ``cuda``, ``half`` and the like."""
         try:
@@ -164,7 +170,7 @@ class TorchRenderer(torch.nn.Module):
 
     @uncompiled
     @takes(ImageTensors, **_ELSEWHERE)
-    @one_at_a_time
+    @announced
     def forward(self, inputs: ImageTensors) -> torch.Tensor:
         """Render images.
 
@@ -173,7 +179,8 @@ class TorchRenderer(torch.nn.Module):
         Returns:
             Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4], or [batch, height, width, 4]
             where an argument has a batch dimension or the renderer's own cameras have; the background is 0.
-        Differentiable: all; stages/README.md says how exactly. Gradients to light and emission,
+        Differentiable: all; by "ray-traced" not geometry, clip_matrices and shell. stages/README.md says how exactly.
+            Gradients to light and emission,
             and where no light bounces to albedo and textures, may be differentiated again, in all tensors;
             others raise NotImplementedError then.
         """
@@ -212,7 +219,7 @@ class TorchRenderer(torch.nn.Module):
 
     @uncompiled
     @takes(ImageTensors, **_ELSEWHERE)
-    @one_at_a_time
+    @announced
     def insert(self, photograph: torch.Tensor, inputs: ImageTensors) -> torch.Tensor:
         """Render the bodies in a photograph whose surfaces the scene's shadow catchers model.
 
@@ -248,7 +255,7 @@ class TorchRenderer(torch.nn.Module):
         light, geometry, clip_matrices = inputs.light, inputs.geometry, inputs.clip_matrices
         has_cameras = self.warp.has_camera_batch and clip_matrices is None
         arguments = Arguments(self.device, cameras=self.cameras if has_cameras else None)
-        slots: dict[str, Any] = {"light": light}
+        slots: dict[str, Any] = {}
         if isinstance(light, torch.Tensor):
             description = describe_coefficients(self.basis, light.shape[-2] if light.ndim > 1 else 0)
             if light.ndim == 3 and light.shape[1] == 2 * light.shape[0]:
@@ -273,7 +280,8 @@ class TorchRenderer(torch.nn.Module):
                     body_rows = self._body_rows(name, number, tensor)
                     of_bodies[number] = arguments.add(f"{name}[{number}]", *body_rows, message_name=message_name)
             slots[name] = of_bodies
-        return arguments, ImageInputs(**slots)
+        filled_inputs: Any = dataclasses.replace(inputs, **slots)  # tensors without a slot stay, and fail
+        return arguments, filled_inputs
 
     def _body_rows(
         self, name: str, number: int, tensor: torch.Tensor
@@ -319,9 +327,9 @@ class TorchRenderer(torch.nn.Module):
             scales: Of each body, [body] or [batch, body]; by default the scene's.
             rest: The bodies in their own spaces, from :meth:`deformed`; by default as their meshes are.
             moving: Bodies that the poses move, by number or name; None for any. The others stand where the scene has
-                them, without a gradient, and where light neither bounces nor is near results about them are cached. By
-                "directional" these come from rays against their meshes, so that they shadow each other by meshes.
-                Bodies that ``rest`` deforms count as moving.
+                them, without a gradient, and results about them are cached, but not where light bounces or is near,
+                with lamps, or by rays. By "directional" these come from rays against their meshes, so that they shadow
+                each other by meshes. Bodies that ``rest`` deforms count as moving.
             pivot: Point of each body's own space that it is turned about and that ``translations`` put in its place:
                 "center", the middle of its mesh's bounds, or points, [body, 3] or [batch, body, 3]; None for the
                 origin, which is the one of the mesh's file. ``scene_poses(pivot=…)`` are the poses to begin with.

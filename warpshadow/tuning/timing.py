@@ -140,7 +140,7 @@ def _neighborhoods(points: np.ndarray) -> np.ndarray:
 
 
 def whole_image(renderer: SceneRenderer) -> Callable[[], wp.array]:
-    """Make the function that draws a whole image, of which nothing is kept from the call before.
+    """Make the function that draws a whole image, without cached results of the call before.
 
     Each call has the bodies in another of two places, a hair's breadth from where the scene has them.
     """

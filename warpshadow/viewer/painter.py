@@ -15,7 +15,7 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera, framed_points
 from warpshadow.assets.color import auto_exposure, linear_to_srgb
 from warpshadow.assets.known_light import as_light
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.light import EnvironmentMap, KnownLightArgument
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
@@ -70,7 +70,7 @@ class Painter:
         self.page_scale = page_scale(low, high)
         self._renderers: RecentCache[Renderer] = RecentCache(_RENDERERS)
         self._sized: RecentCache[Renderer] = RecentCache(_SIZES)
-        self._lights: RecentCache[EnvironmentMap | np.ndarray] = RecentCache(4)
+        self._lights: RecentCache[KnownLightArgument] = RecentCache(4)
         self._geometries: RecentCache[Geometry] = RecentCache(_RENDERERS)
         self._numbers: RecentCache[wp.array] = RecentCache(_NUMBERS)
         self.coarse_light = scene.known_light.coarsened(_COARSE_MAP).as_argument
@@ -183,7 +183,7 @@ class Painter:
 
         return self._geometries.get((key, viewer_state.poses), placed)
 
-    def _light_of(self, viewer_state: ViewerState, quality: Quality) -> EnvironmentMap | np.ndarray:
+    def _light_of(self, viewer_state: ViewerState, quality: Quality) -> KnownLightArgument:
         light = self.coarse_light if quality.is_moving else self.scene.light
         return self._lights.get(
             (viewer_state.turn, viewer_state.scale, quality.is_moving), lambda: viewer_state.light(light)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpshadow import check
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.light import KnownLightArgument
 from warpshadow.maths.directions import check_count
 from warpshadow.scene.body import RECEIVERS, Body
 from warpshadow.scene.files import turned_light
@@ -169,7 +169,7 @@ class ViewerState:
             for body in bodies
         )
 
-    def light(self, light: EnvironmentMap | np.ndarray) -> EnvironmentMap | np.ndarray:
+    def light(self, light: KnownLightArgument) -> KnownLightArgument:
         """Light as it is turned and scaled."""
         return turned_light(light, self.turn, self.scale)
 

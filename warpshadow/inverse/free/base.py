@@ -61,7 +61,7 @@ class Free(abc.ABC):
         """Put values into the world. Differentiable: values."""
 
     def scattered(self, values: Values, number: int, generator: torch.Generator) -> Values:
-        """Other values around these, for a descent that starts at several places; the same where one will do.
+        """Draw values around others, for a descent that starts at several places; equal ones where one start will do.
 
         Args:
             values: The first place.

@@ -46,7 +46,7 @@ class Lamp(FreeOfBody):
         return {"turn": setting.tensor(np.zeros(2)), "log_distance": setting.tensor(0.0)}
 
     def _middle(self, setting: Setting) -> np.ndarray:
-        """Middle of the bodies that do not emit; of those that are not flat, if there are any."""
+        """Middle of the bodies that do not emit, without flat bodies if there are others."""
         others = [body for body in setting.scene.bodies if not body.is_emitter]
         solid = [body for body in others if not body.mesh.is_flat]
         return np.mean([np.mean(body.world_mesh().bounds, axis=0) for body in solid or others], axis=0)

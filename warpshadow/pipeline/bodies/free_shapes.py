@@ -5,7 +5,6 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch
-from warpshadow.device.threads import one_at_a_time
 from warpshadow.pipeline.bodies.geometry import Geometry, as_geometry, splice
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.scene.blockers import free_shape_remark
@@ -26,7 +25,6 @@ class FreeShapes:
         self._bindings: dict[int, SphereBinding] = {}  # by body
         self._warned_of: set[int] = set()
 
-    @one_at_a_time
     def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
         """Bind the vertices of a body to its spheres, which are the nodes (the paper, section 4).
 
@@ -43,7 +41,6 @@ class FreeShapes:
             points, merged_scene.body_spheres[number].centers, count=count, device=merged_scene.device
         )
 
-    @one_at_a_time
     def deformed(
         self,
         body: BodyLike,

@@ -61,7 +61,7 @@ class MergedScene:
         self.uv_faces = self._array(_stacked_faces(uv_faces, _starts(uvs)), wp.vec3i)
 
     def with_settings(self, scene: Scene) -> "MergedScene":
-        """The same bodies with other settings, such as receivers; both share the arrays that are made already."""
+        """Copy with other settings of the bodies, such as receivers; both share the arrays that are made already."""
         other = copy.copy(self)
         other.scene = scene
         pairs = zip(self.scene.bodies, scene.bodies, strict=True)
@@ -292,7 +292,6 @@ class MergedScene:
         """Where the scene has its bodies and their spheres; the batch is 1."""
         return self.placed()
 
-    @one_at_a_time
     def placed(
         self,
         poses: Poses | None = None,

@@ -228,7 +228,7 @@ class Materials:
         return SampleReflectance(samples, self.vertex_albedo, pyramids, footprints)
 
     def untextured_reflectance(self, fragments: Node, items: str) -> SampleReflectance:
-        """The same where no body has a texture."""
+        """Nodes of the samples' reflectance where no body has a texture."""
         none = [Node(name, None, idle="no body has a texture") for name in ("mip pyramids", "footprints")]
         seen = fragments, self.merged_scene.faces, self.vertex_albedo
         samples = Node("reflectance", interpolate, *seen, items=items, extra_inputs=tuple(none))

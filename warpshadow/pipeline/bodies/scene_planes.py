@@ -30,7 +30,7 @@ class GroupPlanes(NamedTuple):
 
     @property
     def blocking(self) -> set[int]:
-        """Numbers of those that block the receivers' light."""
+        """Numbers of the planes that block the receivers' light."""
         return set(self.blockers.is_blocking) - {self.skip}
 
 

@@ -89,7 +89,7 @@ class SelfVisibilityLookup(NamedTuple):
 
 
 class SelfVisibilityLobes(NamedTuple):
-    """The same where light is in harmonics: the body's lobes, and how they are turned."""
+    """Self-visibility of a body where light is in harmonics: its lobes, and how they are turned."""
 
     lobes: wp.array  # [row, order²]
     turn: BodyRotation
@@ -192,7 +192,7 @@ class SelfVisibility:
         return table.of_samples(Fragments(cut(fragments.face_ids, first, end), cut(fragments.barycentrics, first, end)))
 
     def probe_weights_of(self, body: int, vertices: np.ndarray) -> ProbeWeights:
-        """Where vertices of a body, after the last of which backs are numbered, lie among its probes."""
+        """Where vertices of a body lie among its probes; backs are numbered after the last vertex."""
         return self._table(body).of_vertices(from_numpy(vertices, dtype=wp.int32, device=self._merged_scene.device))
 
     def _table(self, body: int) -> ProbeTable:
@@ -269,7 +269,7 @@ class SelfVisibility:
         return self._lobes[body, order]
 
     def missing(self, bodies: tuple[int, ...]) -> int:
-        """Number of bodies, of some, of which nothing is in memory yet."""
+        """Number of bodies, of some, without rows in memory yet."""
         return sum(not (self._merged_scene.is_flat[body] or body in self._rows) for body in bodies)
 
     @property

@@ -105,7 +105,7 @@ class Proxies:
 
     @functools.cached_property
     def seen_patches(self) -> tuple[np.ndarray, np.ndarray]:
-        """The same without the proxies and clusters of flat bodies, which no receiver sees: these have none."""
+        """Patches of each proxy and cluster as receivers see them: none of flat bodies, whose proxies nobody sees."""
         starts, patches = self.patches_of_clusters
         proxies = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
         is_flat = self.merged_scene.is_flat[self.senders.body_of_patch[patches]]

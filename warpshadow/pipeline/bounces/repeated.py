@@ -8,7 +8,7 @@ import warp as wp
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.tail import TERM_COUNT, add_tail
 
-SELF_BOUNCES = 8  # how often a body's light for itself goes on: in a bowl of albedo 0.75 less than 1% is left then
+SELF_BOUNCES = 8  # bounces of light that stays within one body; in a bowl of albedo 0.75 less than 1% is left then
 
 
 def after_bounces(
@@ -23,7 +23,7 @@ def after_bounces(
 
         B₀ = reflect(light(None), None),   Bₙ₊₁ = reflect(light(Bₙ), Bₙ)
 
-    After the last of these, ``light`` is not asked again, but ``reflect`` goes on: light within bodies.
+    After the last bounce between bodies, ``reflect`` alone is repeated: light that stays within one body.
 
     Args:
         bounces: How often light bounces.
@@ -32,8 +32,8 @@ def after_bounces(
         reflect: Function of that light and of B: adds the light from their own body, none for None, and returns the
             next radiosity.
         areas: Of patches, shape [patch].
-        self_bounces: How often ``reflect`` goes on alone: after the last of a number of bounces, and after each of
-            "all"; 0 where bodies send themselves no light.
+        self_bounces: How often ``reflect`` alone is repeated after the last bounce, or after each of "all"; 0 where
+            bodies send themselves no light.
     Returns:
         Radiosity, vec3 of shape [batch, patch].
     """

@@ -131,7 +131,7 @@ class StaticBounces:
     def add_free_bounces(
         self, direct: Node, transfers: Node, light: Input, points: LitPoints, materials: Materials
     ) -> Node:
-        """The same in free light; its transfer among the colors of the scene is cached.
+        """Add bounces to the shading of free light; its transfer among the colors of the scene is cached.
 
         Args:
             direct: As above.

@@ -255,7 +255,7 @@ def _openness(trees: list[FaceTree], receivers: Receivers) -> wp.array:
 
 
 def _instances(results: wp.array, *batches: Sequence[Any] | wp.array | np.ndarray) -> Iterator[tuple[Any, ...]]:
-    """Results of each instance, unless empty, with its part of each batch, of which the last serves the rest."""
+    """Results of each instance, unless empty, with its item of each batch; the last item serves the rest."""
     for instance in range(len(results) if results.size else 0):
         yield results[instance], *(batch[min(instance, len(batch) - 1)] for batch in batches)
 

@@ -21,7 +21,7 @@ _ROUNDING = 1e-5  # of the largest coordinate, by which a vertex may lie outside
 def find_bodies_with_buried_vertices(
     merged_scene: MergedScene, positions: np.ndarray, face_ids: Sequence[np.ndarray], bodies: Sequence[int]
 ) -> np.ndarray:
-    """Find the bodies of which images show a face from a buried vertex to one in the open, or through a plane.
+    """Find bodies with a face in view from a buried vertex to one in the open, or through a plane.
 
     Args:
         merged_scene: All bodies.

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, cut, expand
-from warpshadow.device.constants import constant
+from warpshadow.device.constants import Identity, constant
 from warpshadow.device.launch import varies
 from warpshadow.pipeline.bodies.convex import GroupConvexParts, SceneConvexParts
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
@@ -43,16 +43,16 @@ class BodySides:
     def __init__(self, planes: ScenePlanes, positions: wp.array):
         self._planes, self.positions = planes, positions
         self._is_captured = positions.device.is_capturing
-        self._sides: dict[int, tuple[wp.array, wp.array]] = {}
+        self._sides: dict[Identity, wp.array] = {}
 
     def sides_of(self, frames: wp.array, planes: PlaneBlockers) -> wp.array:
         """The side of each plane on which each body lies, [batch, body, plane], found once for all receivers."""
-        if id(frames) in self._sides:  # held with their result, so that the id stays theirs
-            return self._sides[id(frames)][1]
+        if (key := Identity(frames)) in self._sides:
+            return self._sides[key]
         corners, first_corner = self._planes.corners(self.positions), self._planes.first_corner
         sides = find_body_sides(corners, first_corner, frames, planes)
         if frames.device.is_capturing == self._is_captured:  # what a graph makes, only its replays fill
-            self._sides[id(frames)] = frames, sides
+            self._sides[key] = sides
         return sides
 
 
@@ -86,7 +86,7 @@ class OwnBody:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Receivers whose light the same blockers block: of all bodies, all but their own, or those that move."""
+    """Receivers that share their blockers: all bodies, all but their own, or the moving ones."""
 
     points: wp.array  # [batch, receiver] vec3
     normals: wp.array  # [batch, receiver] vec3

@@ -33,7 +33,7 @@ class BlockerKinds(NamedTuple):
     planes: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
     convex: tuple[int, ...] = ()  # bodies that block the light of others by the convex parts that they consist of
     solids: tuple[int, ...] = ()  # convex bodies whose parts block their own light, too; of others rays are traced
-    bulging_bodies: tuple[int, ...] = ()  # out of which their spheres bulge: receivers are vertices, whatever is chosen
+    bulging_bodies: tuple[int, ...] = ()  # bodies out of which their spheres bulge; they are lit at vertices
 
     @property
     def separate(self) -> set[int]:
@@ -48,7 +48,7 @@ class VisibleSurfaces(NamedTuple):
     normals: wp.array  # likewise
     fragments: Fragments
     spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres
-    is_adaptive: np.ndarray  # bodies whose samples interpolate, which are flat, bool of shape [body]
+    is_adaptive: np.ndarray  # flat bodies whose samples interpolate, bool of shape [body]
     supersampling: int  # samples of a pixel across and down
     # footprints of receivers at samples, given the fragments that these see, and the shape of all receivers
     footprints_of: Callable[[Fragments, tuple[int, int]], wp.array]
@@ -113,11 +113,11 @@ class LitPoints:
         return self._cached.get(name, (None, None))[1]
 
     def cached_of_bodies(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
-        """The same of a value that is equal for all points among the same bodies."""
+        """A cached value that all points among the same bodies share."""
         return _cached(self._cached_of_bodies, name, key, make)
 
     def with_receivers(self: Points, receivers: Node) -> Points:
-        """Other receivers, of which nothing is cached, among the same blockers, any of which may move."""
+        """Copy with other receivers, without cached values; any of the blockers may move."""
         points = copy.copy(self)
         points.receivers_node, points.static_bodies, points.is_scene_view = receivers, None, False
         points._cached = {}

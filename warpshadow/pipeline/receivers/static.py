@@ -4,8 +4,9 @@ Where the spheres of moving bodies let the share T_q of the light of a cell thro
 
     B = Σ_q T_q S_q,  S_q = ∫_{cell q} L(ω) V(ω) max(n·ω, 0) dω / π,
 
-V the visibility past the meshes of the static bodies. S does not change, so rays find it, and the shadows of static
-bodies on static ones are exact. In log-SH space the sum over the spheres of the static bodies does not change.
+V the visibility past the meshes of the static bodies. S does not change, so rays find it, as many as ``samples`` says:
+shadows of static bodies on static ones are those of their meshes. In log-SH space the sum over the spheres of the
+static bodies does not change.
 """
 
 import functools

@@ -162,7 +162,7 @@ def _find_transmittances(
 
 
 def _find_where_enclosed(blockers: Blockers, emitter: int, body: int | None) -> np.ndarray:
-    """Find the geometries in which an emitter is within the bounds of a body, parts of which may be behind it, bool.
+    """Find the geometries with an emitter inside the bounds of a body, so that parts may be behind it, bool.
 
     Where arrays cannot be read, the scene's own bodies tell.
     """

@@ -11,7 +11,8 @@ class LightInput(Input):
 
     Args:
         value: The light.
-        shell: Of the light, vec4 of shape [batch], where it is not the scene's; None where it is, or is infinitely far.
+        shell: Center and radius of the sphere that sends this light, vec4 of shape [batch]; None for the scene's, if it
+            has one.
         why_new: As for :class:`Input`.
     """
 

@@ -45,7 +45,7 @@ class ProjectedCells(NamedTuple):
     spot_shares: np.ndarray | None = None  # share of the light of sharp cells that their spot has [direction]
     samples: np.ndarray | None = None  # even ones in cells without light [direction, 8, 3]
     sun: SunCells | None = None  # the brightest cells, where bodies want rays to them
-    patches: ShellPatches | None = None  # that send the light, whose coefficients are theirs; None where it is far
+    patches: ShellPatches | None = None  # of near light: coefficients are then radiances of these, not of cells
 
     @property
     def cosine_directions(self) -> np.ndarray:

@@ -10,6 +10,7 @@ import warp as wp
 
 from warpshadow.assets.known_light import KnownLight
 from warpshadow.assets.light import EnvironmentMap
+from warpshadow.device.constants import Identity
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
@@ -266,8 +267,8 @@ class PortionedVisibility(Node):
     """Visibility of receivers, found group by group and portion by portion; classes below add steps.
 
     Each step is a function of the method. The value is a list of the results of all portions. Without a gradient,
-    one portion's transfer vectors are in memory at a time; all of them only where they are the result: in free light,
-    or where bounces cache visibility since colors vary. Receivers with cached rows are one portion.
+    known light is shaded portion by portion, and each portion's transfer vectors are dropped after it. They are kept
+    for free light, and where bounces reuse them. Receivers with cached rows are one portion.
 
     Args:
         method: How light is blocked.
@@ -425,7 +426,7 @@ def blockers_node(method: SphereMethod, points: LitPoints) -> Node:
 def self_visibility_node(method: SphereMethod, points: LitPoints, projected_light: Node | ProjectedLight) -> Node:
     """Node of the receivers' self-visibility lookups, by body; the same for any receivers among the same bodies."""
     make = functools.partial(_self_visibility, method, points.blocker_kinds, projected_light)
-    return points.cached_of_bodies("self-visibility", id(projected_light), make)
+    return points.cached_of_bodies("self-visibility", Identity(projected_light), make)
 
 
 def _self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds, projected_light: Node | ProjectedLight) -> Node:

@@ -6,16 +6,16 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.assets.light import LIGHT, EnvironmentMap, check_coefficients
+from warpshadow.assets.light import LIGHT, EnvironmentMap, KnownLightArgument, check_coefficients
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.stages.light.shading import shade
 
-Light: TypeAlias = EnvironmentMap | np.ndarray | wp.array
+Light: TypeAlias = KnownLightArgument | wp.array
 """A map, SH coefficients [order², 3], or free coefficients in the renderer's basis, vec3 [batch, coefficient]."""
 
 LARGEST_COEFFICIENT = 1e3 * check.LARGEST
-"""Light is larger in another basis than it was given in: 64 harmonics add up in a direction."""
+"""Limit of coefficients after a change of basis: a sum of 64 harmonics of the largest accepted size exceeds that."""
 
 
 def check_light(light: object) -> None:

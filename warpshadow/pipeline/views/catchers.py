@@ -29,7 +29,7 @@ class CatchersAlone:
         self._views, self._merged_scene, self._numbers = views, merged_scene, merged_scene.scene.catchers
 
     def with_cameras(self, cameras: Sequence[Camera]) -> CatchersAlone:
-        """The same for other cameras."""
+        """Copy for other cameras."""
         alone = copy.copy(self)
         alone._views = self._views.with_cameras(cameras)
         return alone

@@ -19,13 +19,13 @@ from warpshadow.stages.receivers.sample_receivers import MAX_SHARED_SAMPLES
 from warpshadow.stages.silhouettes.find import Silhouettes
 
 _MIN_SHARED_SIZE = 128
-"""Pixels of the shorter side of stills from which they do: in smaller ones shadows are as thin as pixels. Crowds and
-fences of 72² to 96² pixels were 3.5 to 6.9% off, and are 2.7 to 2.9%, in 2.2 times the CPU time; from 128² on the error
-is the same."""
+"""Shorter side of a still [pixels] from which samples of different faces share a receiver. In smaller stills shadows
+are as thin as pixels: crowds and fences of 72² to 96² pixels were 3.5 to 6.9% off, and are 2.7 to 2.9% off with a
+receiver for each sample, in 2.2 times the CPU time. From 128² on the error is the same."""
 
 
 class ReceiverFinder:
-    """Finds the receivers of a view: which bodies have them where is known before anything is drawn.
+    """Finds the receivers of a view; whether a body has them at vertices or at samples is known when the view is made.
 
     Args:
         method: Method of visibility.

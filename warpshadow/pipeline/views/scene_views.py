@@ -17,7 +17,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
 from warpshadow.device.constants import use
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.bodies.geometry import PLACED, Geometry
+from warpshadow.pipeline.bodies.geometry import PLACED, Geometry, as_geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Clock, Input, Node, identity
 from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
@@ -107,10 +107,11 @@ class SceneViews:
             self.last = (view, self.last[1]) if self._is_of_scene(view) else (self.last[0], view)
 
     def lazy_view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
-        """Build a view of which nothing is computed yet, or reuse a cached one if its inputs match."""
+        """Build a view, and compute nothing of it, or reuse a cached one if its inputs match."""
         vertices, spheres, cameras, static_bodies = self.vertices, self._spheres, self.clip_matrices, None
         last, poses, matrices = self.last[1], [None], self._cameras
         if geometry is not None:
+            geometry = as_geometry("geometry", geometry)
             rest = self._merged_scene.rest.arrays()
             for name, array in geometry.arrays().items():
                 check.shape(f"geometry.{name}", array.shape, ("batch", *rest[name].shape[1:]), PLACED)

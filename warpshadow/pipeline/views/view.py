@@ -118,7 +118,7 @@ class View(LitPoints):
             normals = Node("normals", vertex_normals, vertices, faces, items=corners)
         else:
             normals = Node("normals", static_bodies.with_moving_normals, vertices, static_bodies.normals, items=corners)
-        # receivers at vertices move with these alone; receivers at samples move with the samples' fragments, too
+        # gradients of receivers: at vertices to the vertices alone, at samples to the fragments, too
         seen = sides if self._scene_receivers.at_samples(blocker_kinds).any() else detached(sides)
         item_text = functools.partial(receiver_text, self.weak)
         arguments = [vertices, normals, seen, detached(silhouettes), detached(clip)]

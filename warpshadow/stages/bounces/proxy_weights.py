@@ -1,4 +1,4 @@
-"""Weights of proxies: how much each counts among those that a block of receivers sees through a cell.
+"""Weights of proxies: how much each counts, of all that a block of receivers sees through a cell.
 
     w = f s⁴ / (d² + (r/4)²)²
 

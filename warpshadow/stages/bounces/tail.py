@@ -9,7 +9,7 @@ chapter 5]:
 
 and T is applied to it once more: B_1 + Σ_j c_j D_(j+1). Sums of three geometric series are exact, such as of light that
 a room, a bowl and a gap keep for different times. Where terms are nearly multiples of each other the smallest c count:
-1e-7 is added to the diagonal of M, with D of length 1. In a closed room of white walls there is no sum: where
+1e-7 is added to the diagonal of M, with D of length 1. In a closed room of white walls the series diverges: where
 <D_1, R> is below 0 or above 50 <D_1, D_1>, terms from D_3 on count as if each were 0.98 of the one before.
 
 In a room of albedo 0.8 with a window the energy is 0.3% off; by one term in place of three it would be 0.9%, and at an

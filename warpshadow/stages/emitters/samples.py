@@ -1,4 +1,4 @@
-"""Samples of emitters: points of their surfaces, each of which stands for a patch of it.
+"""Samples of emitters: points of their surfaces that stand for patches of it.
 
 A patch k has a middle y_k and an area vector A_k, its normal times its area. Both are sums over vertices and faces that
 move with the body: of pieces p of faces f, with middles z_p,
@@ -178,7 +178,7 @@ EVERYWHERE = (3.0, 4.0)
 
 
 class EmitterBeams(NamedTuple):
-    """Beams of emitters (:mod:`.beams`), some of which may have none."""
+    """Beams of emitters (:mod:`.beams`); some emitters may have none."""
 
     beams: np.ndarray  # of the emitters, EVERYWHERE for none, shape [emitter, 2]
     vertices: SparseMatrix  # weights of all vertices in the emitters' axes, [emitter, vertex]

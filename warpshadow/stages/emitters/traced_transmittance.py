@@ -193,7 +193,7 @@ def _beam_to_point(
 def _beam_to_facing_point(
     surface: EmitterSurface, sample: int, start: int, point: wp.vec3, normal: wp.vec3, is_two_sided: int
 ):
-    """Likewise, of the first point from a start on that faces the receiver, above its horizon."""
+    """The way to the first point, from a start on, that faces the receiver above its horizon, and how much."""
     point_count = surface.point_faces.shape[1]
     beam = wp.vec3()
     facing = float(0.0)

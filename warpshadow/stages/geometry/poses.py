@@ -114,7 +114,7 @@ class Poses:
         return self._shifted(pivots, -1.0)
 
     def of_pivots(self, pivots: wp.array) -> "Poses":
-        """The inverse of :meth:`about`: with translations to where pivots are. Differentiable likewise."""
+        """The inverse of :meth:`about`: translations are then where pivots are. Differentiable: as there."""
         return self._shifted(pivots, 1.0)
 
     def _shifted(self, pivots: wp.array, sign: float) -> "Poses":

@@ -42,7 +42,7 @@ def _horizon_weights(heights: Chunk):
 
 @wp.func
 def horizon_weight(height: float):
-    """The same of one cell."""
+    """H of one cell, and a little more."""
     return height * height * (3.0 - 2.0 * height) + _MIN_HORIZON_WEIGHT
 
 

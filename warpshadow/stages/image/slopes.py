@@ -199,7 +199,7 @@ def _add_shading_gradients(
     first_sample_face: int,
     run: int,
     adj_samples: wp.array2d(dtype=wp.vec4),
-    # out
+    # sums
     adj_clip_positions: wp.array2d(dtype=wp.vec4),
 ):
     """A thread owns a run of samples of all instances; ``fragment`` is the index of a sample in flat images."""

@@ -1,28 +1,30 @@
-"""Fronts: which side of a plane receivers are on, from 1 in front of it to 0 behind it.
+"""Fronts: the side of a plane that a receiver is on, from 1 in front of the plane to 0 behind it.
 
-Where bodies touch, points lie in the plane of another body, or within float32 of it; they are on the side on which
-their own body lies. With h the height of a receiver, n its normal, N the plane's, and l to u the heights of its body,
+Where bodies touch, a receiver may lie in the plane of another body, where its own height says nothing. Its body tells:
 
     front = S(b + (1 − b²) n·N + 2 h / m),  b = (u + l) / max(u − l, m), from −1 to 1
 
-S is the smoothstep from 0 at −1 to 1 at 1, and m the margin of the plane, a thousandth of a texel. So a body wholly in
-front of the plane (b = 1) or behind it (b = −1) has all its receivers there; one that the plane cuts has them where
-their heights are; and in the same plane (b = 0, h = 0) normals decide. The height term has no gradient: over so short a
-way as the margin it would be hundreds of times that of receivers beside it.
+h is the receiver's height above the plane, n its normal, and N the plane's normal. The receiver's body lies between the
+heights l and u. S is the smoothstep from 0 at −1 to 1 at 1, and m the plane's margin, a thousandth of a texel.
 
-Receivers nearer than 2 k to a plane, k = 5 m, are moved off it, by k at most, before they are lit. A receiver on the
-line where two planes meet would lie in both, and each, seen edge-on, would cover none of the half that it hides.
+- Body in front of the plane (b = 1), or behind it (b = −1): all its receivers are on that side.
+- Body that the plane cuts: the height h of each receiver decides.
+- Body in the plane (b = 0, h = 0): its normals decide.
+
+The height term has no gradient: over the short margin it would be hundreds of times the gradients of other receivers.
+
+A receiver on the line where two planes meet would lie in both. Seen edge-on, neither would cover the half of the sky
+that it hides. So receivers nearer than 2 k to a plane, k = 5 m, are moved off it, by k at most, before they are lit:
 
     x + Σ_f (2 front_f − 1) k (1 − (h_f / 2 k)²)² N_f
 
-A patch sample is on the side on which the blocker nearest to its patch is, with c the height of that sphere's center
-and r its radius:
+A patch sample is on the side of the sphere that is nearest to its patch, of radius r, with its center at the height c:
 
     front = S(1.25 (h + c) / r)
 
-So a sphere that touches a plane from above has all its patch samples in front, also where the body has sunk into the
-ground a little, since receivers see its proxies. 1.25 leaves room for spheres that bulge out of their mesh. The light
-of a patch sample so changes over the depth of a sphere, not of a margin.
+So a sphere that touches a plane from above has all its patch samples in front, even if the body has sunk into the
+ground a little. 1.25 leaves room for spheres that bulge out of their mesh. The light of a patch sample changes over the
+depth of a sphere, then, not of a margin.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 MAX_EDGES = 128
-"""Edges of an outline at most: beyond, it is that of the rectangle, of which the mesh takes its share by texels."""
+"""Edges of an outline at most; with more, the rectangle blocks by the share that the mesh has of each texel."""
 
 _NEIGHBOR_WEIGHT = 0.002
 """How much texels count in their neighbors, which have their light if nothing of their own is seen."""

@@ -46,7 +46,7 @@ class Receivers(NamedTuple):
     sample_fragments: Fragments | None = None  # side and barycentrics of each sample receiver, [batch, sample receiver]
     samples: wp.array | None = None  # [view, sample receiver] int32, the sample that owns each, −1 for none
     has_mean_slope: wp.array | None = None  # [view, sample] bool, samples whose receivers do not move over the screen
-    footprints: wp.array | None = None  # [batch, receiver − on static] vec3, of :mod:`.footprints`; None for points
+    footprints: wp.array | None = None  # [batch, receiver − on static] vec3; None where receivers are points
 
     def without_bodies(self) -> "Receivers":
         """Drop the bodies of receivers."""

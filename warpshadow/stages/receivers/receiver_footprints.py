@@ -29,7 +29,7 @@ def _find_receiver_footprints(
     # out
     footprints: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver, of which those at samples are the last."""
+    """A thread owns a receiver; receivers at samples are the last."""
     batch, receiver = wp.tid()
     fragment_batch = instance_in(batch, sides.shape[0])
     sample = receiver - first

@@ -217,6 +217,7 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         scratch: wp.array3d(dtype=Lane),
         # out
         adj_probe_weights: wp.array2d(dtype=wp.vec3),
+        # sums
         adj_resampling_weights: wp.array3d(dtype=wp.float32),
     ):
         """A thread owns a block of receivers:  w̄_qk += T̄_q Σ_j b_j S_jqk,  b̄_j += Σ_qk T̄_q w_qk S_jqk.

@@ -201,6 +201,7 @@ def _rotate_lobes_adjoint(
     adj_rotated_lobes: wp.array3d(dtype=wp.float32),
     # out
     adj_probe_weights: wp.array2d(dtype=wp.vec3),
+    # sums
     adj_angles: wp.array(dtype=wp.vec3),
 ):
     """A thread owns a receiver:  δ̄_a += K̄ᵀ G_a K,  b̄_j += L_jᵀ Dᵀ K̄."""

@@ -84,7 +84,7 @@ def exits_from_shell(points: wp.array, directions: wp.array, shell: wp.array) ->
 
 
 def exits_on_host(points: np.ndarray, directions: np.ndarray, shell: np.ndarray) -> np.ndarray:
-    """The same of NumPy arrays, which broadcast, [..., 3]; a ray that misses the shell leaves it where it is nearest.
+    """Exits of rays in NumPy, [..., 3], with broadcasting; a ray that misses the shell leaves it where it is nearest.
 
     Args:
         shell: Center and radius, shape [4].

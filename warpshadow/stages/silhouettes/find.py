@@ -1,4 +1,4 @@
-"""Silhouettes: where neighboring samples see different surfaces, one of which ends between them.
+"""Silhouettes: where neighboring samples see different surfaces, and one surface ends between them.
 
 The line between two samples is one of three: the edge where the surface of the nearer one ends before the center of the
 other; the line where two surfaces intersect; or, where both see one surface, a crease, an edge across which normals

@@ -197,7 +197,7 @@ def _make_transmit_adjoint(has_horizon: bool, has_footprints: bool, lanes: int) 
 
     @wp.func(inline=True)
     def find_weight(sphere_view: SphereView, task: TransmittanceTask):
-        """None counts more than another."""
+        """All spheres have weight 1."""
         return Lane(1.0)
 
     @wp.func(inline=True)
@@ -234,6 +234,7 @@ def _make_transmit_adjoint(has_horizon: bool, has_footprints: bool, lanes: int) 
         reached_bundles: wp.array3d(dtype=wp.int32),
         # out
         adj_points: wp.array2d(dtype=wp.vec3),
+        # sums
         adj_centers: wp.array2d(dtype=wp.vec3),
         adj_radii: wp.array2d(dtype=wp.float32),
         adj_extents: wp.array2d(dtype=wp.float32),

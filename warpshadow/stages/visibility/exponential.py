@@ -205,6 +205,7 @@ def _make_exponentiate(order: int, base: str, keeps_powers: bool, lanes: int) ->
         # out
         powers: wp.array4d(dtype=Lane),
         visibility: wp.array3d(dtype=wp.float32),
+        # sums
         faults: wp.array(dtype=wp.int32),
     ):
         """A thread owns a block of receivers: base approximation of f / 2^p, then p squarings.

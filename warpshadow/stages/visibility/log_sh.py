@@ -212,6 +212,7 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
         # out
         adj_points: wp.array2d(dtype=wp.vec3),
         adj_normals: wp.array2d(dtype=wp.vec3),
+        # sums
         adj_centers: wp.array2d(dtype=wp.vec3),
         adj_radii: wp.array2d(dtype=wp.float32),
         adj_extents: wp.array2d(dtype=wp.float32),

@@ -27,8 +27,8 @@ from warpshadow.stages.visibility.merging import (
     merge_if_many,
 )
 
-CLUSTERS_PER_RUN = 4  # spheres of a run, and then of a cluster, are culled together: they had best be neighbors
-ALL_BUNDLES = -1  # the number of candidates for a run: all that there are
+CLUSTERS_PER_RUN = 4  # clusters culled by one bound, which is tight if neighbors in the list are neighbors in space
+ALL_BUNDLES = -1  # number of candidates of a run: all bundles
 
 
 @wp.func
@@ -248,9 +248,9 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
     """Make the kernel function that visits the spheres that a block of receivers can see.
 
     Args:
-        cull: (receivers, bound, traversal_index, candidates, task) → to how many candidates the spheres in a bound may
-            matter. ``traversal_index`` is the first sphere's in the traversal. ``candidates`` is how many there are:
-            :data:`ALL_BUNDLES` for a run, and for a cluster the bundles that its run may reach.
+        cull: (receivers, bound, traversal_index, candidates, task) → number of bundles of directions that a bounding
+            sphere may darken, out of ``candidates``: :data:`ALL_BUNDLES` for a run, and for a cluster the bundles that
+            its run may darken. ``traversal_index`` is the place of the first sphere in the traversal.
         visit: (receivers, sphere_view, count, task), called for each sphere with the count of its cluster; for an
             adjoint → SphereAdjoint.
         Task: Struct of all else that these two read and write.
