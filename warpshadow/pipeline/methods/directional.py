@@ -15,6 +15,7 @@ from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.methods.cell_lobes import CellLobes
+from warpshadow.pipeline.methods.glossy_cells import shading_with_cells
 from warpshadow.pipeline.methods.sharpest_cells import SharpestCells, find_share_of_sharpest_light, find_sharpest_cells
 from warpshadow.pipeline.node import Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, Group
@@ -283,7 +284,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         """Direct known light on points; where no light bounces, with the cells of bodies that shine."""
         if self.merged_scene.scene.bounces or points.materials.roughness is None:
             return super().known_shading(points, light)
-        return field_of(self.lobes.shading(points, light), "shading")
+        return field_of(shading_with_cells(self, points, light), "shading")
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of the light of each cell that static bodies let through.
