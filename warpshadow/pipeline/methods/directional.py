@@ -89,10 +89,10 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: ProjectedCells
     ) -> dict[int, SelfVisibilityLookup]:
         """Lookups of the receivers of some bodies. Differentiable: rotations."""
-        towards = projected_light.blocking_directions if projected_light.spots is None else projected_light.spots
+        directions = projected_light.blocking_directions if projected_light.spots is None else projected_light.spots
         has_sun = projected_light.sun is not None
         lookups = self.scene_blockers.self_visibility.lookups
-        return lookups(bodies, rotations, towards, projected_light.half_angles, has_sun=has_sun)
+        return lookups(bodies, rotations, directions, projected_light.half_angles, has_sun=has_sun)
 
     def find_visibility(self, group: Group, projected_light: ProjectedCells) -> CellVisibility:
         """Transmittance of a group past its own body, spheres and convex parts."""
@@ -272,8 +272,8 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     def share_of_sharpest_light(self, group: Group) -> np.ndarray | None:
         """Share of a group's unblocked light that still comes from the sharpest cells; None where nothing blocks."""
         sharpest = self._sharpest_cells
-        towards, scales = self.free_basis.blocking_directions, self._scales(sharpest.relative_radius)
-        return find_share_of_sharpest_light(group, sharpest, towards, **scales)
+        cell_directions, scales = self.free_basis.blocking_directions, self._scales(sharpest.relative_radius)
+        return find_share_of_sharpest_light(group, sharpest, cell_directions, **scales)
 
     @functools.cached_property
     def lobes(self) -> CellLobes:

@@ -107,7 +107,7 @@ class LobeVisibility:
 
         Without shadows it is 1.
         """
-        return Node("", lambda towards: wp.full(towards.shape, 1.0, wp.float32, device=towards.device), directions)
+        return Node("", lambda samples: wp.full(samples.shape, 1.0, wp.float32, device=samples.device), directions)
 
     def sun_transmittance(self, lobes: LitLobes, suns: Node) -> Node:
         """Transmittance towards directions in suns, as many in each, float32 of shape [batch, receiver, direction].
