@@ -29,7 +29,7 @@ from test_end_to_end import (
 )
 
 import warpshadow as ws
-from warpshadow.pipeline.bounces import moving_bounces, patches, static_bounces
+from warpshadow.pipeline.bounces import moving_bounces, patches, static_bounces, static_form_factors
 from warpshadow.pipeline.receivers import groups
 from warpshadow.torch import TorchRenderer, rotation_matrices
 
@@ -535,7 +535,7 @@ def test_what_bounces_between_bodies_that_stand_still_is_kept(method, name, monk
     def refuse(*_, **__):
         raise AssertionError("it is computed again")
 
-    monkeypatch.setattr(static_bounces, "trace_form_factors", refuse)
+    monkeypatch.setattr(static_form_factors, "trace_form_factors", refuse)
     monkeypatch.setattr(type(renderer.warp._method), "find_visibility", refuse)
     monkeypatch.setattr(type(renderer.warp._method), "find_visibility_past_planes", refuse)
     with torch.no_grad():

@@ -13,7 +13,7 @@ import warpshadow as ws
 from warpshadow import inverse
 from warpshadow.inverse.uncertainty import NormalMatrix
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.bounces import static_bounces
+from warpshadow.pipeline.bounces import static_form_factors
 from warpshadow.pipeline.methods.directional import Directional
 from warpshadow.pipeline.shading import lobe_light
 from warpshadow.pipeline.shading.lobe_light import LobeVisibility
@@ -329,7 +329,7 @@ def test_a_metal_in_a_still_has_no_grain_where_it_mirrors_the_ground(monkeypatch
     light = ws.EnvironmentMap.constant()
     scene = ws.Scene([ball, ws.Body(ws.plane(8.0, 16))], light, camera, bounces=1, supersampling=1)
     few = ws.render(scene)[14:21, 7:17, :3]
-    monkeypatch.setattr(static_bounces, "STILL_RAYS", 4096)
+    monkeypatch.setattr(static_form_factors, "STILL_RAYS", 4096)
     many = ws.render(scene)[14:21, 7:17, :3]
     assert np.linalg.norm(few - many) < 0.006 * np.linalg.norm(many)  # 0.4%; 1.0% where their noise differs
 

@@ -46,7 +46,7 @@ BANNED = {
     *("ReceiverInPlane", "scaled_to_sky", "see_samples", "SeenSurface", "trace_factors", "transmittance_towards"),
     *("turn_from_planes", "unblocked_batch", "with_rows", "with_tail", "without_owners"),
     *("find_openness", "HIT_ROWS", "load_hit", "node_centers", "open_shares", "open_weights", "Openness", "SIDE_ROWS"),
-    *("BeamAdjoint", "NearestBorder", "on_static"),
+    *("BeamAdjoint", "NearestBorder", "on_static", "towards"),
     *("placed_blockers", "ShellLight"),
     *("contact_density", "FLAT", "Fronts", "Rays", "TOLERANCES", "touching_points"),
     *("BLEND_START", "BodyExtents", "GLOSS_METHODS", "positions_cycle"),
@@ -176,6 +176,10 @@ def test_a_module_uses_no_banned_name(path):
         if name in BANNED_EVERYWHERE or BANNED_PARTS.intersection(name.lower().split("_")):
             banned.add(f"{name} (line {line})")
     assert not banned
+
+
+def test_no_file_has_more_than_500_lines():
+    assert not [f"{path}: {count}" for path in FILES if (count := len(path.read_text("utf-8").splitlines())) > 500]
 
 
 def test_names_of_functions_and_of_members_are_read():

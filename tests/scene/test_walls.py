@@ -37,7 +37,7 @@ def test_walls_are_the_sides_of_a_box_and_show_the_map_from_its_middle():
     target = CENTER + (0.8, 0.5, 0.33)
     camera = ws.Camera.look_at(CENTER, target, fov_y=70, size=(32, 32))
     scene = ws.Scene(walls, DARK, camera, ws.Visibility("directional"), supersampling=1)
-    shown, expected = ws.render(scene)[..., :3], light.towards(camera.rays()[1])
+    shown, expected = ws.render(scene)[..., :3], light.radiance_from(camera.rays()[1])
     assert np.median(np.abs(shown - expected)) < 1e-3
     assert shown.mean() == pytest.approx(expected.mean(), rel=0.02)
 

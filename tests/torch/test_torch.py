@@ -538,11 +538,22 @@ def test_nine_free_numbers_descend_to_a_rotation(renderer):
 
 
 @pytest.mark.parametrize(
-    ("method", "bounces"), [*((method, 0) for method in METHODS), ("directional", 2), ("log-sh", 2), ("ray-traced", 1)]
+    ("method", "bounces", "roughness"),
+    [
+        *((method, 0, None) for method in METHODS),
+        ("directional", 2, None),
+        ("log-sh", 2, None),
+        ("ray-traced", 1, None),
+        ("directional", 0, 0.4),
+        ("directional", 1, 0.4),
+        ("ray-traced", 0, 0.4),
+    ],
 )
-def test_the_memory_of_a_call_is_free_without_garbage_collection(method, bounces):
+def test_the_memory_of_a_call_is_free_without_garbage_collection(method, bounces, roughness):
     """Python's collector knows nothing of how much memory an array holds, least of all on a GPU."""
-    renderer = TorchRenderer(dataclasses.replace(small_scene(method), bounces=bounces))
+    scene = small_scene(method)
+    bodies = dataclasses.replace(scene.bodies[0], roughness=roughness), *scene.bodies[1:]
+    renderer = TorchRenderer(dataclasses.replace(scene, bodies=bodies, bounces=bounces))
     rotations, translations, scales = renderer.scene_poses()
     has_gradient = method != "ray-traced"
 

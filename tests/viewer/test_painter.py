@@ -167,7 +167,7 @@ def test_light_that_is_near_is_behind_the_bodies_where_rays_leave_it(scene):
     expected = dataclasses.replace(scene, camera=camera).background()
     behind = painter._behind(viewer_state, camera, FULL)
     np.testing.assert_allclose(behind, expected, rtol=1e-4, atol=1e-4)
-    assert difference(scene.light.towards(camera.rays()[1]), expected) > 0.01  # of the same map far away
+    assert difference(scene.light.radiance_from(camera.rays()[1]), expected) > 0.01  # of the same map far away
 
 
 def test_gloss_that_is_changed_is_that_of_the_scene_so_changed(scene):

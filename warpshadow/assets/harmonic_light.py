@@ -56,7 +56,7 @@ class HarmonicLight:
         """The light itself, which is as smooth as a map of few rows."""
         return self
 
-    def towards(self, directions: np.ndarray) -> np.ndarray:
+    def radiance_from(self, directions: np.ndarray) -> np.ndarray:
         """Radiance from directions [..., 3], 0 where it rings below that, float64 of shape [..., 3]."""
         harmonics = sh.evaluate(sh.order_of("light", self.coefficients), directions.reshape(-1, 3))
         radiance: np.ndarray = np.maximum(harmonics @ self.coefficients, 0).reshape(directions.shape)

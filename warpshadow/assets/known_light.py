@@ -26,7 +26,7 @@ class KnownLight(Protocol):
     def as_argument(self) -> KnownLightArgument:
         """The light as scenes and renderers take it."""
 
-    def towards(self, directions: np.ndarray) -> np.ndarray:
+    def radiance_from(self, directions: np.ndarray) -> np.ndarray:
         """Radiance from directions [..., 3], shape [..., 3]."""
 
     def rotated(self, degrees: float) -> KnownLight:

@@ -263,7 +263,7 @@ class EnvironmentMap:
         blocks = cropped_radiance.reshape(height // step, step, width // step, step, 3)
         return Picture(blocks.mean(axis=(1, 3)))._repr_png_()
 
-    def towards(self, directions: np.ndarray) -> np.ndarray:
+    def radiance_from(self, directions: np.ndarray) -> np.ndarray:
         """Radiance from directions, interpolated between pixels.
 
         Args:
@@ -282,6 +282,11 @@ class EnvironmentMap:
             rows, columns = np.clip(up + down, 0, height - 1), (left + right) % width
             radiance += weight[..., None] * self.radiance[rows, columns]
         return radiance
+
+    def towards(self, directions: np.ndarray) -> np.ndarray:
+        """Do the same as :meth:`radiance_from`, its name from now on."""
+        check.warn("EnvironmentMap.towards: it is called radiance_from from now on", DeprecationWarning)
+        return self.radiance_from(directions)
 
     def directions(self) -> np.ndarray:
         """Unit vectors to the pixel centers, float32, shape [height, width, 3]."""

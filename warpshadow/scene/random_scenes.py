@@ -335,13 +335,13 @@ def _random_sky(rng: np.random.Generator) -> EnvironmentMap:
 
 def _random_lamps(rng: np.random.Generator) -> EnvironmentMap:
     """One to four lobes of light from above (von Mises and Fisher's) in a dim room."""
-    towards = sh.equirectangular_directions(SKY_HEIGHT)
-    radiance = rng.uniform(0.05, 0.5) * _random_tint(rng) * np.ones_like(towards)
+    directions = sh.equirectangular_directions(SKY_HEIGHT)
+    radiance = rng.uniform(0.05, 0.5) * _random_tint(rng) * np.ones_like(directions)
     for _ in range(rng.integers(1, 5)):
         middle = _random_direction(rng) + (0, 1, 0)
         middle /= np.linalg.norm(middle)
         sharpness = 10 ** rng.uniform(0.3, 2)  # half as bright 60° to 7° from the middle
-        lobe = np.exp(sharpness * (towards @ middle - 1)) * sharpness / (1 - np.exp(-2 * sharpness))
+        lobe = np.exp(sharpness * (directions @ middle - 1)) * sharpness / (1 - np.exp(-2 * sharpness))
         radiance += rng.uniform(0.2, 1.5) * lobe[..., None] / 2 * _random_tint(rng)
     return EnvironmentMap(radiance)
 

@@ -301,7 +301,7 @@ class Scene:
         _, directions = self.camera.resized(supersampling).rays()
         if self.shell is not None:
             directions = exits_on_host(self.camera.eye, directions, self.shell)
-        radiance = self.known_light.towards(directions)
+        radiance = self.known_light.radiance_from(directions)
         height, width, _ = directions.shape
         samples = radiance.reshape(height // supersampling, supersampling, width // supersampling, supersampling, 3)
         return samples.mean(axis=(1, 3)).astype(np.float32)

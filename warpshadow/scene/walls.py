@@ -74,7 +74,7 @@ def _wall(light: EnvironmentMap, side: str, edges: np.ndarray, center: np.ndarra
         beams = on_wall(np.stack([u, v], axis=-1) - 0.5)
         distances = np.linalg.norm(beams, axis=-1, keepdims=True)
         weights = distances**-3.0  # solid angle of a point's part of the wall, but for a factor
-        weighted = weights * light.towards(beams / distances)
+        weighted = weights * light.radiance_from(beams / distances)
         sums = [item.reshape(point_count, texels, point_count, -1).sum(axis=(0, 2)) for item in (weighted, weights)]
         return sums[0] / sums[1]
 

@@ -197,7 +197,7 @@ class Painter:
         directions = camera.rays()[1]
         if light.shell is not None:
             directions = exits_on_host(camera.eye, directions, light.shell)
-        return light.towards(directions).astype(np.float32)
+        return light.radiance_from(directions).astype(np.float32)
 
 
 class RecentCache(Generic[Value]):

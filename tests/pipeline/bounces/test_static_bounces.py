@@ -10,7 +10,7 @@ import trimesh
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.pipeline.bounces import static_bounces
+from warpshadow.pipeline.bounces import static_bounces, static_form_factors
 from warpshadow.pipeline.bounces.patches import ScenePatches
 from warpshadow.pipeline.methods import ray_traced as rays
 from warpshadow.stages.bounces.irradiance_cache import choose_cache_points, interpolation_matrix
@@ -156,13 +156,13 @@ def test_black_bodies_send_nothing(renderer, direct):
 @pytest.mark.parametrize("given", ["light", "light and colors"])
 def test_iterations_are_those_of_a_twin_in_float64(given, method, monkeypatch):
     """B = a M (S + F B) and I = W F B, of the form factors F that rays find; some go on where patches share a body."""
-    traced, find = [], static_bounces.scale_to_sky
+    traced, find = [], static_form_factors.scale_to_sky
 
     def listed(*arguments):
         traced.append(find(*arguments))
         return traced[-1]
 
-    monkeypatch.setattr(static_bounces, "scale_to_sky", listed)
+    monkeypatch.setattr(static_form_factors, "scale_to_sky", listed)
     scene = ball_on_ground()
     scene = replace(scene, bodies=(replace(scene.bodies[0], mesh=bowl()), *scene.bodies[1:]))
     scene = replace(scene, visibility=ws.Visibility(method, samples=512))
@@ -296,7 +296,11 @@ def test_no_ray_is_traced_in_an_iteration(renderer, monkeypatch):
         def refuse(*_, **__):
             raise AssertionError("rays are traced")
 
-        for module, name in ((static_bounces, "trace_form_factors"), (rays, "trace_shading"), (rays, "trace_transfer")):
+        for module, name in (
+            (static_form_factors, "trace_form_factors"),
+            (rays, "trace_shading"),
+            (rays, "trace_transfer"),
+        ):
             monkeypatch.setattr(module, name, refuse)
         again = renderer(light, albedo={"wall": wall}), renderer(albedo={"wall": wall})
         renderer(2 * light, albedo={"wall": 0.5 * wall})
@@ -371,7 +375,7 @@ def test_the_bounced_light_of_a_bulb_in_a_shade_has_no_grain_in_stills(monkeypat
     camera = ws.Camera.look_at((0, 1.5, 4), (0, 1.6, 0), fov_y=35, size=(24, 24))
     scene = ws.Scene(bodies, ws.EnvironmentMap.constant(0.0), camera, bounces="all")
     still = ws.render(scene)[..., :3]
-    monkeypatch.setattr(static_bounces, "STILL_RAYS", 2048)
+    monkeypatch.setattr(static_form_factors, "STILL_RAYS", 2048)
     expected = ws.render(scene)[..., :3]
     assert np.linalg.norm(still - expected) < 0.07 * np.linalg.norm(expected)
 

@@ -64,13 +64,13 @@ class Lamp(FreeOfBody):
 
     def _placed(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor]:
         """Translation and scale of the body. Differentiable: values."""
-        middle, towards, distance = self._start(setting)
+        middle, start_direction, distance = self._start(setting)
         body = setting.scene.bodies[self.number]
         factor = (_REACH * values["log_distance"]).exp()
-        tangents = setting.tensor(constraints.perpendicular_basis([towards]))
+        tangents = setting.tensor(constraints.perpendicular_basis([start_direction]))
         turn = _REACH * values["turn"]
         angle = (turn.square().sum() + 1e-12).sqrt()
-        direction = angle.cos() * setting.tensor(towards) + angle.sin() / angle * (turn @ tangents)
+        direction = angle.cos() * setting.tensor(start_direction) + angle.sin() / angle * (turn @ tangents)
         scale = body.scale * factor
         own_middle = setting.tensor(body.rotation_matrix() @ setting.middle(self.number))
         return setting.tensor(middle) + distance * factor * direction - scale * own_middle, scale
@@ -83,11 +83,11 @@ class Lamp(FreeOfBody):
             setting: Of the fit.
             number: Of the direction, 0 to STARTS − 1; they repeat.
         """
-        _, towards, _ = self._start(setting)
+        _, start_direction, _ = self._start(setting)
         above = fibonacci(2 * STARTS)[:, [0, 2, 1]]
         direction = above[above[:, 1] > 0][number % STARTS]
-        sideways = constraints.perpendicular_basis([towards]) @ direction
-        angle = np.arctan2(np.linalg.norm(sideways), direction @ towards)
+        sideways = constraints.perpendicular_basis([start_direction]) @ direction
+        angle = np.arctan2(np.linalg.norm(sideways), direction @ start_direction)
         turn = angle / max(float(np.linalg.norm(sideways)), 1e-12) * sideways / _REACH
         return {"turn": setting.tensor(turn), "log_distance": values["log_distance"].detach().clone()}
 

@@ -15,6 +15,7 @@ from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.methods.cell_lobes import CellLobes
+from warpshadow.pipeline.methods.glossy_cells import shading_with_cells
 from warpshadow.pipeline.methods.sharpest_cells import SharpestCells, find_share_of_sharpest_light, find_sharpest_cells
 from warpshadow.pipeline.node import Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, Group
@@ -88,10 +89,10 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: ProjectedCells
     ) -> dict[int, SelfVisibilityLookup]:
         """Lookups of the receivers of some bodies. Differentiable: rotations."""
-        towards = projected_light.blocking_directions if projected_light.spots is None else projected_light.spots
+        directions = projected_light.blocking_directions if projected_light.spots is None else projected_light.spots
         has_sun = projected_light.sun is not None
         lookups = self.scene_blockers.self_visibility.lookups
-        return lookups(bodies, rotations, towards, projected_light.half_angles, has_sun=has_sun)
+        return lookups(bodies, rotations, directions, projected_light.half_angles, has_sun=has_sun)
 
     def find_visibility(self, group: Group, projected_light: ProjectedCells) -> CellVisibility:
         """Transmittance of a group past its own body, spheres and convex parts."""
@@ -271,8 +272,8 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     def share_of_sharpest_light(self, group: Group) -> np.ndarray | None:
         """Share of a group's unblocked light that still comes from the sharpest cells; None where nothing blocks."""
         sharpest = self._sharpest_cells
-        towards, scales = self.free_basis.blocking_directions, self._scales(sharpest.relative_radius)
-        return find_share_of_sharpest_light(group, sharpest, towards, **scales)
+        cell_directions, scales = self.free_basis.blocking_directions, self._scales(sharpest.relative_radius)
+        return find_share_of_sharpest_light(group, sharpest, cell_directions, **scales)
 
     @functools.cached_property
     def lobes(self) -> CellLobes:
@@ -283,7 +284,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         """Direct known light on points; where no light bounces, with the cells of bodies that shine."""
         if self.merged_scene.scene.bounces or points.materials.roughness is None:
             return super().known_shading(points, light)
-        return field_of(self.lobes.shading(points, light), "shading")
+        return field_of(shading_with_cells(self, points, light), "shading")
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of the light of each cell that static bodies let through.

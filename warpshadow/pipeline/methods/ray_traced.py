@@ -233,7 +233,7 @@ class TracedLobes(LobeVisibility):
         trees = self._method.trees_around(points)
         if openness is None:
             openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))
-        return Node("light of blockers", find_blocked_radiance, diffuse, lobes.select(direct), openness)
+        return Node("light of blockers", find_blocked_radiance, diffuse, points.select(direct), openness)
 
 
 def _trace_lobes(trees: list[FaceTree], receivers: Receivers, directions: wp.array) -> wp.array:

@@ -56,14 +56,14 @@ def find_sharpest_cells(
 
 
 def find_share_of_sharpest_light(
-    group: Group, sharpest: SharpestCells, towards: np.ndarray, *, softness: float, merging: float
+    group: Group, sharpest: SharpestCells, cell_directions: np.ndarray, *, softness: float, merging: float
 ) -> np.ndarray | None:
     """Share of a group's unblocked light that still comes from the sharpest cells.
 
     Args:
         group: The receivers, with the blockers around them.
         sharpest: The sharpest cells.
-        towards: Directions of all cells, [direction, 3].
+        cell_directions: Directions of all cells, [direction, 3].
         softness, merging: Of spheres' shadows, in radii of the sharpest cells.
     Returns:
         Shape [batch, receiver]; None where nothing blocks.
@@ -93,7 +93,7 @@ def find_share_of_sharpest_light(
     lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
     receiver_normals = normals.numpy()
     plane_normals = receiver_normals[:, :1]  # points of a plane have this normal or its opposite
-    facing = plane_normals @ towards.T  # [batch, 1, cell]
+    facing = plane_normals @ cell_directions.T  # [batch, 1, cell]
     whole = [4 / len(power) * np.maximum(cosines, 0) @ power for cosines in (facing, -facing)]
     is_front = (receiver_normals @ plane_normals.transpose(0, 2, 1))[..., 0] > 0
     unblocked = np.where(is_front, *whole)

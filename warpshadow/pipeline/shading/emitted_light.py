@@ -137,8 +137,10 @@ def _find_transmittances(
         if transmittance_of_cells is not None and not is_own:
             is_within = _find_where_enclosed(blockers, body, group.body)
             if not is_within.all():
-                towards = find_directions_to_samples(points, placed_samples, span)
-                transmittance_self = interpolate_transmittance(transmittance_of_cells, normals, towards, EMITTER_CELLS)
+                directions = find_directions_to_samples(points, placed_samples, span)
+                transmittance_self = interpolate_transmittance(
+                    transmittance_of_cells, normals, directions, EMITTER_CELLS
+                )
             if is_within.any():
                 # cells tell whether rays leave the body: a bulb in a shade would be hidden by the shade's far side
                 with unrecorded():

@@ -12,6 +12,7 @@ from warpshadow.device.constants import constant
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.node import Node, field_of
 from warpshadow.pipeline.receivers.lit_points import LitPoints
+from warpshadow.pipeline.shading.glossy_points import GlossyPoints
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.stages.gloss.prefilter import prefilter
 from warpshadow.stages.gloss.suns import SeparatedLight, Suns, directions_in_suns, separate_suns
@@ -23,10 +24,9 @@ _MIN_SAMPLES = 8  # of a receiver, however many receivers a pixel has: as many a
 class LitLobes(NamedTuple):
     """Receivers on bodies that shine, and their light."""
 
-    points: LitPoints
+    points: GlossyPoints
     light: LightInput  # known or free, which says where shadows have to be sharp
     all_points: LitPoints  # the receivers of the image, among which they are
-    select: Callable[[Node], Node]  # the light on points out of a node of light on all_points
 
 
 class LobeVisibility:
@@ -105,7 +105,7 @@ class LobeVisibility:
 
         Without shadows it is 1.
         """
-        return Node("", lambda towards: wp.full(towards.shape, 1.0, wp.float32, device=towards.device), directions)
+        return Node("", lambda samples: wp.full(samples.shape, 1.0, wp.float32, device=samples.device), directions)
 
     def sun_transmittance(self, lobes: LitLobes, suns: Node) -> Node:
         """Transmittance towards directions in suns, as many in each, float32 of shape [batch, receiver, direction].

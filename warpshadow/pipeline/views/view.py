@@ -223,12 +223,15 @@ class View(LitPoints):
 
     def _glossy(self, shading: Node, light: LightInput, materials: Materials, reflectance: Node) -> Node:
         """Node of the samples where bodies shine: of light in the surface's color, and of light that has its own."""
-        from warpshadow.pipeline.shading.gloss import GlossyPoints
+        from warpshadow.pipeline.shading.gloss import mix_gloss
+        from warpshadow.pipeline.shading.glossy_points import GlossyPoints
+        from warpshadow.pipeline.shading.lobe_light import LitLobes
 
         arguments = self.cameras, self.fragments_node, self.clip_positions
-        points = self.cached("gloss", None, lambda: GlossyPoints(self.method, self, *arguments))
-        lobes = points.lit(light, self)
-        colored, white = points.mix(lobes, shading, materials, self.transport.blocked_radiance(lobes, materials))
+        points = self.cached("gloss", None, lambda: GlossyPoints(self, *arguments))
+        lobes = LitLobes(points, light, self)
+        blocked = self.transport.blocked_radiance(lobes, materials)
+        colored, white = mix_gloss(self.method, lobes, shading, materials, blocked)
         return self._sum_of(self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance))
 
     @property

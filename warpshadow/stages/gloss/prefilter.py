@@ -233,8 +233,8 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         texels_per_radian = float(levels[0][1]) / wp.pi
         for block in range((light.shape[2] + lanes - 1) // lanes):
             first = block * lanes
-            towards = load_samples(directions[batch, receiver], first)
-            half_turns, turns, _sine = find_place_angles(towards.x, towards.y, towards.z)
+            sample_directions = load_samples(directions[batch, receiver], first)
+            half_turns, turns, _sine = find_place_angles(sample_directions.x, sample_directions.y, sample_directions.z)
             for lane in range(wp.min(lanes, light.shape[2] - first)):
                 height = _find_height(filters[batch, receiver, first + lane][2], texels_per_radian)
                 level = int(height)
@@ -266,8 +266,8 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         texels_per_radian = float(levels[0][1]) / wp.pi
         for block in range((adj_light.shape[2] + lanes - 1) // lanes):
             first = block * lanes
-            towards = load_samples(directions[batch, receiver], first)
-            half_turns, turns, sine = find_place_angles(towards.x, towards.y, towards.z)
+            sample_directions = load_samples(directions[batch, receiver], first)
+            half_turns, turns, sine = find_place_angles(sample_directions.x, sample_directions.y, sample_directions.z)
             adj_polar = Lane()
             adj_azimuth = Lane()
             for lane in range(wp.min(lanes, adj_light.shape[2] - first)):
@@ -295,12 +295,12 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             if adj_directions:
                 # of the angle of y + i sine, and of that of -z + i x
                 square = wp.max(wp.cw_mul(sine, sine), Lane(1.0e-12))
-                adj_polar = wp.cw_div(adj_polar, square + wp.cw_mul(towards.y, towards.y))
-                adj_square = wp.cw_mul(wp.cw_mul(adj_polar, towards.y), wp.cw_div(sine, square))
+                adj_polar = wp.cw_div(adj_polar, square + wp.cw_mul(sample_directions.y, sample_directions.y))
+                adj_square = wp.cw_mul(wp.cw_mul(adj_polar, sample_directions.y), wp.cw_div(sine, square))
                 adj_azimuth = wp.cw_div(adj_azimuth, square)
-                x = wp.cw_mul(adj_square, towards.x) - wp.cw_mul(adj_azimuth, towards.z)
+                x = wp.cw_mul(adj_square, sample_directions.x) - wp.cw_mul(adj_azimuth, sample_directions.z)
                 y = -wp.cw_mul(adj_polar, sine)
-                z = wp.cw_mul(adj_square, towards.z) + wp.cw_mul(adj_azimuth, towards.x)
+                z = wp.cw_mul(adj_square, sample_directions.z) + wp.cw_mul(adj_azimuth, sample_directions.x)
                 for lane in range(wp.min(lanes, adj_light.shape[2] - first)):
                     adj_direction = wp.vec3(x[lane], y[lane], z[lane])
                     adj_directions[batch, receiver, first + lane] = (

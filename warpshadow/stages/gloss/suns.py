@@ -190,10 +190,10 @@ def _disc_density(slope_square: float, disc: float):
 
 
 @wp.func
-def _reflect_disc(view: wp.vec3, width: wp.vec3, towards: wp.vec3, solid_angle: float):
+def _reflect_disc(view: wp.vec3, width: wp.vec3, direction: wp.vec3, solid_angle: float):
     """Reflection f c of a disc, and that with (1 − v·h)⁵, in the frame of a lobe."""
     towards_viewer = wp.vec3(view[0], 0.0, view[1])
-    mirror = wp.normalize(towards_viewer + towards)
+    mirror = wp.normalize(towards_viewer + direction)
     view_cosine = wp.dot(towards_viewer, mirror)
     area = width[0] * width[2] - width[1] * width[1]
     slope_x = (width[2] * mirror[0] - width[1] * mirror[1]) / (area * mirror[2])
@@ -201,10 +201,10 @@ def _reflect_disc(view: wp.vec3, width: wp.vec3, towards: wp.vec3, solid_angle: 
     disc = solid_angle / (4.0 * wp.pi * view_cosine * area * mirror[2] * mirror[2] * mirror[2])
     density = _disc_density(slope_x * slope_x + slope_y * slope_y, disc)
     density = density * 4.0 * view_cosine / (solid_angle * mirror[2])
-    spread_x = width[0] * towards[0] + width[1] * towards[1]
-    spread_y = width[1] * towards[0] + width[2] * towards[1]
-    slant = wp.sqrt(spread_x * spread_x + spread_y * spread_y + towards[2] * towards[2])
-    weight = 0.5 * density * towards[2] / (towards[2] * view[2] + view[1] * slant)
+    spread_x = width[0] * direction[0] + width[1] * direction[1]
+    spread_y = width[1] * direction[0] + width[2] * direction[1]
+    slant = wp.sqrt(spread_x * spread_x + spread_y * spread_y + direction[2] * direction[2])
+    weight = 0.5 * density * direction[2] / (direction[2] * view[2] + view[1] * slant)
     base = wp.max(1.0 - view_cosine, 0.0)
     return wp.vec2(weight, weight * base * base * base * base * base)
 
@@ -244,8 +244,8 @@ def _reflect_suns(
     for i in range(directions.shape[0]):
         cosine = wp.dot(normal, directions[i])
         if cosine > 0.0:
-            towards = wp.vec3(wp.dot(tangent, directions[i]), wp.dot(bitangent, directions[i]), cosine)
-            weights = _reflect_disc(view, width, towards, solid_angles[i]) / float(count)
+            direction = wp.vec3(wp.dot(tangent, directions[i]), wp.dot(bitangent, directions[i]), cosine)
+            weights = _reflect_disc(view, width, direction, solid_angles[i]) / float(count)
             for k in range(count):
                 light = transmittance[transmittance_batch, receiver, i * count + k] * irradiance[i]
                 straight_suns += weights[0] * light

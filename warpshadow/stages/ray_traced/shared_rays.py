@@ -119,9 +119,9 @@ def _make_trace(is_near: bool) -> wp.Kernel:
         irradiance = wp.vec3()
         last_face = int(-1)
         for packet in range(directions.shape[0]):
-            towards = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
-            ray_directions = beams_to_light(shell, point, towards)
-            cosine = cosines_of(shell, normal, towards, ray_directions)
+            light_directions = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
+            ray_directions = beams_to_light(shell, point, light_directions)
+            cosine = cosines_of(shell, normal, light_directions, ray_directions)
             facing_rays = bits_above(cosine, 0.0)
             open_rays = int(0)
             if facing_rays != 0:

@@ -24,24 +24,24 @@ def make_beams(is_near: bool) -> tuple[wp.Function, wp.Function]:
     if not is_near:
 
         @wp.func(inline=True)
-        def far_beams(shell: wp.vec4, point: wp.vec3, towards: Vectors):
-            return towards
+        def far_beams(shell: wp.vec4, point: wp.vec3, light_directions: Vectors):
+            return light_directions
 
         @wp.func(inline=True)
-        def far_cosines(shell: wp.vec4, normal: wp.vec3, towards: Vectors, beams: Vectors):
-            return dot_direction(normal, towards)
+        def far_cosines(shell: wp.vec4, normal: wp.vec3, light_directions: Vectors, beams: Vectors):
+            return dot_direction(normal, light_directions)
 
         return far_beams, far_cosines
 
     @wp.func(inline=True)
-    def near_beams(shell: wp.vec4, point: wp.vec3, towards: Vectors):
+    def near_beams(shell: wp.vec4, point: wp.vec3, light_directions: Vectors):
         offset = center_of(shell) - point
-        return add(scale(Lane(shell[3]), towards), Vectors(Lane(offset[0]), Lane(offset[1]), Lane(offset[2])))
+        return add(scale(Lane(shell[3]), light_directions), Vectors(Lane(offset[0]), Lane(offset[1]), Lane(offset[2])))
 
     @wp.func(inline=True)
-    def near_cosines(shell: wp.vec4, normal: wp.vec3, towards: Vectors, beams: Vectors):
+    def near_cosines(shell: wp.vec4, normal: wp.vec3, light_directions: Vectors, beams: Vectors):
         distance2 = wp.max(dot(beams, beams), Lane(_MIN_DISTANCE2 * shell[3] * shell[3]))
-        facing = wp.max(dot(towards, beams), Lane(0.0))
+        facing = wp.max(dot(light_directions, beams), Lane(0.0))
         square = wp.cw_mul(distance2, distance2)
         return wp.cw_div(shell[3] * shell[3] * wp.cw_mul(facing, dot_direction(normal, beams)), square)
 
