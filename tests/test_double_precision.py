@@ -188,7 +188,8 @@ def test_gradients_of_transmittance_are_exact(count, softness, double, device, c
 def test_gradients_of_transmittance_of_receivers_with_footprints_are_exact(double, device, check, spheres):
     directions = double("maths.directions").fibonacci(16)
     transmittance = double("stages.visibility.directional").transmittance
-    areas = put(np.array([[9.0, 0.5, 4.0, 1e-4, 0.0]]), wp.float64, device)  # spheres are some ten units wide
+    areas = np.array([[9.0, 0.5, 4.0, 1e-4, 0.0]])[..., None] * [1.0, -2.0, 0.5]  # spheres are some ten units wide
+    areas = put(areas, wp.vec3d, device)
     points, (_, normals), *rest = spheres
     up = put(normals, wp.vec3d, device)
     check(lambda p, c, r: transmittance(p, up, c, r, directions, softness=0.1, footprints=areas), points, *rest)

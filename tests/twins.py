@@ -213,12 +213,13 @@ def exponential(f, base, threshold, *, quiet=6.0, loud=24.0):
 # ------------------------------------------------------------------------------------------ directional
 
 
-def transmittance(points, centers, radii, directions, softness=0.35, footprints=0.0):
-    """Transmittance of spheres towards directions, [vertex, direction], by angles; footprints are areas [vertex]."""
+def transmittance(points, centers, radii, directions, softness=0.35, footprints=(0.0, 0.0, 0.0)):
+    """Transmittance of spheres towards directions, [vertex, direction], by angles; footprints are [vertex, 3]."""
     toward, cosine, weight = cones(points[:, None], centers, radii)
     theta = np.arccos(cosine)
     squared = np.maximum(np.sum((centers - points[:, None]) ** 2, axis=-1) - radii**2, 0)
-    spread = 5 / 12 * np.broadcast_to(footprints, len(points))[:, None]
+    areas = np.abs(np.broadcast_to(footprints, points.shape) @ directions.T).mean(axis=1)
+    spread = 5 / 12 * areas[:, None]
     spread = spread / np.maximum(squared + 2 * spread, 1e-37)
     width = np.arcsin(np.sqrt(np.sin(softness * 2 / np.sqrt(len(directions))) ** 2 + spread))
     low = np.cos(np.minimum(theta + width, np.pi))

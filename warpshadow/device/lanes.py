@@ -221,7 +221,6 @@ class LaneFunctions(NamedTuple):
     subtract: wp.Function
     find_block: wp.Function
     load: wp.Function
-    load_numbers: wp.Function
     load_columns: wp.Function
     multiply_by_columns: wp.Function
     store_columns: wp.Function
@@ -377,15 +376,6 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
             y[lane] = value[1]
             z[lane] = value[2]
         return Vectors(x, y, z)
-
-    @wp.func
-    def load_numbers(values: wp.array(dtype=wp.float32), block: int):
-        """A block's numbers."""
-        last = values.shape[0] - 1
-        result = Lane()
-        for lane in range(lanes):
-            result[lane] = values[wp.min(block * lanes + lane, last)]
-        return result
 
     @wp.func
     def add_vectors(a: Vectors, block: int, values: wp.array(dtype=wp.vec3)):

@@ -64,10 +64,10 @@ def test_footprints_widen_edges_like_the_twins_the_more_the_nearer_these_are(fac
     points, normals, centers, radii = twins.random_scene(4, vertex_count=40)
     points[:4] = centers[:4] + radii[:4, None] * np.float32([0, 1.0, 0])  # touching: edges of 45°
     normals[:4] = [0, -1, 0]
-    areas = np.random.default_rng(0).uniform(0, 0.3, 40) ** 2
+    areas = np.random.default_rng(0).uniform(-0.4, 0.4, (40, 3)) ** 3  # as vectors: large along some directions
     areas[::5] = 0
     directions = cells.fibonacci(64)
-    footprints = wp.array(areas[None], dtype=wp.float32, device=device)
+    footprints = wp.array(areas[None], dtype=wp.vec3, device=device)
     arguments = points, normals if facing else None, centers, radii
     got = transmittance(*arguments, directions, device, softness=0.1, footprints=footprints)
     expected = twins.transmittance(*wide(points, centers, radii), directions, 0.1, areas)
@@ -80,7 +80,7 @@ def test_an_edge_moves_over_a_footprint_as_its_mean_over_a_square_does(device):
     side, towards = 0.1, np.tile([0.0, 0, 1], (16, 1))
     x = np.linspace(0.7, 1.3, 400)
     points = np.stack([x, np.zeros(400), np.full(400, -1.0)], axis=1)
-    footprints = wp.full((1, 400), side**2, dtype=wp.float32, device=device)
+    footprints = wp.full((1, 400), wp.vec3(0.0, 0.0, side**2), dtype=wp.vec3, device=device)
     options = {"device": device, "softness": 2.1 * cells.MIN_WIDTH, "footprints": footprints}
     steps = np.diff(transmittance(points, None, [[0, 0, 0]], [1.0], towards, **options)[:, 0])
     middles = (x[1:] + x[:-1]) / 2
@@ -97,10 +97,10 @@ def test_a_bundle_that_footprints_alone_bring_into_reach_is_not_culled(count, de
     softness = 0.9 * np.pi / 4 / cells.cell_radius(count)
     for axis in cells.bundle_cones(directions).axes:
         point = np.float32(1.0001 * axis)[None]  # touches the sphere, which is opposite to the axis; alone in its group
-        footprints = wp.full((1, 1), 100.0, dtype=wp.float32, device=device)
+        footprints = wp.full((1, 1), wp.vec3(100.0, 50.0, -80.0), dtype=wp.vec3, device=device)
         options = {"softness": softness, "footprints": footprints}
         got = transmittance(point, None, [[0, 0, 0]], [1.0], directions, device, **options)
-        expected = twins.transmittance(*wide(point, [[0, 0, 0]], [1.0]), directions, softness, 100.0)
+        expected = twins.transmittance(*wide(point, [[0, 0, 0]], [1.0]), directions, softness, [100.0, 50.0, -80.0])
         assert np.abs(got - expected).max() < FLOAT32[64]
 
 
@@ -340,7 +340,7 @@ def test_arrays_that_do_not_fit_together_are_refused(device):
         directional.transmittance(points, zeros(2, 4), centers, radii, cells.fibonacci(16))
     with pytest.raises(ValueError, match=r"centers: got shape \(1, 3\), expected \[2, sphere\]"):
         directional.transmittance(points, normals, zeros(1, 3), radii, cells.fibonacci(16))
-    footprints = zeros(2, 4, dtype=wp.float32)
+    footprints = zeros(2, 4)
     with pytest.raises(ValueError, match=r"footprints: got shape \(2, 4\), expected \[2, 5\]"):
         directional.transmittance(points, normals, centers, radii, cells.fibonacci(16), footprints=footprints)
     with pytest.raises(ValueError, match=r"radii: got shape \(2, 2\), expected \[2, 3\]"):

@@ -164,7 +164,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if projected_light.sharp_cells is None:
             return transmittance
         directions, slots, scale = projected_light.sharp_cells
-        sharp = block(directions, footprints=group.seen_footprints(directions), **scales(scale))
+        sharp = block(directions, footprints=group.footprints, **scales(scale))
         return blend_sharp_cells(transmittance, sharp, slots, projected_light.spot_shares)
 
     def _scales(self, scale: float) -> dict[str, Any]:

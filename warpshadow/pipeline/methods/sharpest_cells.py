@@ -73,9 +73,10 @@ def find_share_of_sharpest_light(
     if not radii.shape[1] and group.planes is None and group.convex_parts_around is None:
         return None
     if radii.shape[1]:
-        footprints = group.seen_footprints(directions)
         arguments = points, normals, centers, radii, directions
-        transmittance = directional.transmittance(*arguments, softness=softness, merging=merging, footprints=footprints)
+        transmittance = directional.transmittance(
+            *arguments, softness=softness, merging=merging, footprints=group.footprints
+        )
     else:
         transmittance = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
     coverages = []

@@ -24,7 +24,6 @@ from warpshadow.stages.light.cached_cells import CachedRows
 from warpshadow.stages.planes.fronts import NearestBlockers, PlaneFronts, find_body_sides, find_fronts
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers
 from warpshadow.stages.receivers.find import Receivers
-from warpshadow.stages.receivers.receiver_footprints import find_seen_areas
 from warpshadow.stages.receivers.sample_receivers import Span
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
@@ -120,10 +119,6 @@ class Group:
         """Coverage of cells by them."""
         assert self.own_parts is not None
         return self.own_parts.coverage(self.points, self.normals, directions, radius)
-
-    def seen_footprints(self, directions: np.ndarray) -> wp.array | None:
-        """Areas of the footprints of receivers as light sees them from directions; None where they are points."""
-        return None if self.footprints is None else find_seen_areas(self.footprints, directions)
 
     def looked_up_transmittance(self) -> wp.array | None:
         """Transmittance past the receivers' own body, looked up, [batch, receiver, cell]; None without rows."""

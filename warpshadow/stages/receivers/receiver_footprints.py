@@ -87,27 +87,3 @@ def find_receiver_footprints(
     inputs += [positions, clip_positions, wp.vec2(2.0 / size[1], 2.0 / size[0]), shape[1] - count]
     launch(_find_receiver_footprints, shape, inputs=inputs, outputs=[footprints])
     return footprints
-
-
-@wp.kernel(enable_backward=False)
-def _find_seen_areas(
-    # in
-    footprints: wp.array2d(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    # out
-    areas: wp.array2d(dtype=wp.float32),
-):
-    """A thread owns a receiver."""
-    batch, receiver = wp.tid()
-    total = float(0.0)
-    for i in range(directions.shape[0]):
-        total += wp.abs(wp.dot(footprints[batch, receiver], directions[i]))
-    areas[batch, receiver] = total / float(directions.shape[0])
-
-
-def find_seen_areas(footprints: wp.array, directions: np.ndarray) -> wp.array:
-    """Find the areas of footprints as light sees them from directions [direction, 3], on average over these."""
-    areas = empty(footprints.shape, dtype=wp.float32, device=footprints.device)
-    inputs = [footprints, constant(directions, wp.vec3, footprints.device)]
-    launch(_find_seen_areas, footprints.shape, inputs=inputs, outputs=[areas])
-    return areas

@@ -78,7 +78,8 @@ def _task_type(lanes: int) -> Any:
 def _make_load_task(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.Function:
     """Make the kernel function that loads the receivers and directions of a thread."""
     Lane, TransmittanceTask = lane_type(lanes), _task_type(lanes)
-    load_receivers = make_load_receivers(has_horizon, lanes, has_footprints)
+    load_receivers, fn = make_load_receivers(has_horizon, lanes), make_lane_functions(lanes)
+    load, dot_direction = fn.load, fn.dot_direction
 
     @wp.func(inline=lanes == 1)
     def load_task(
@@ -92,6 +93,11 @@ def _make_load_task(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.F
         reached_bundles: wp.array3d(dtype=wp.int32),
     ):
         batch, block, receivers = load_receivers(inputs, row)
+        if wp.static(has_footprints):  # as the light sees them, on average over its directions
+            footprints = load(inputs.footprints[batch], block)
+            for direction in range(cells.directions.shape[0]):
+                receivers.footprints += wp.abs(dot_direction(cells.directions[direction], footprints))
+            receivers.footprints = receivers.footprints / float(cells.directions.shape[0])
         slot = scratch_slot(worker, row * all_ends.shape[1] + span)
         ends = all_ends[row, span]
         task = TransmittanceTask(cells, span * ends.shape[0], ends, reached_bundles[slot], scratch[slot])
@@ -280,8 +286,9 @@ def transmittance(
             :mod:`warpshadow.stages.visibility.merging`), where there are 512 or more; 0 for never.
         skip: Spheres that are left out: the first, and the one after the last.
         clusters: Of these spheres, from :func:`.traversal.find_clusters`, where they are found already.
-        footprints: Areas f² for which receivers stand, as the light sees them [scene units²], float32 of shape [batch,
-            vertex], by which the falloff is wider; None where receivers are points.
+        footprints: Areas f² for which receivers stand, as vectors along the normals of their planes or against them
+            [scene units²], vec3 of shape [batch, vertex]: by their size as the directions see it, on average, the
+            falloff is wider; None where receivers are points.
     Returns:
         Transmittance in [0, 1], float32 of shape [batch, vertex, direction].
     Raises:

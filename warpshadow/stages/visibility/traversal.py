@@ -118,7 +118,7 @@ class TraversalInputs:
 
     points: wp.array2d(dtype=wp.vec3)
     normals: wp.array2d(dtype=wp.vec3)  # empty where there is no horizon
-    footprints: wp.array2d(dtype=wp.float32)  # empty where receivers are points
+    footprints: wp.array2d(dtype=wp.vec3)  # empty where receivers are points
     spheres: SphereClusters
 
 
@@ -179,17 +179,17 @@ def receiver_lanes_type(lanes: int) -> Any:
     class ReceiverLanes:
         points: Vectors
         normals: Vectors  # 0 where there is no horizon
-        footprints: Lane  # 0 where they are points
+        footprints: Lane  # areas as the light sees them, 0 where they are points
 
     return ReceiverLanes
 
 
 @functools.cache
-def make_load_receivers(has_horizon: bool, lanes: int, has_footprints: bool = False) -> wp.Function:
-    """Make the kernel function that loads a block of receivers: inputs, row → instance, block, receivers."""
+def make_load_receivers(has_horizon: bool, lanes: int) -> wp.Function:
+    """Make the kernel function that loads a block of receivers that are points: inputs, row → instance, block, they."""
     Lane, Vectors, ReceiverLanes = lane_type(lanes), vectors_type(lanes), receiver_lanes_type(lanes)
     fn = make_lane_functions(lanes)
-    find_block, load, load_numbers = fn.find_block, fn.load, fn.load_numbers
+    find_block, load = fn.find_block, fn.load
 
     @wp.func(inline=True)
     def load_receivers(inputs: TraversalInputs, row: int):
@@ -197,10 +197,7 @@ def make_load_receivers(has_horizon: bool, lanes: int, has_footprints: bool = Fa
         normals = Vectors()
         if wp.static(has_horizon):
             normals = load(inputs.normals[batch], block)
-        footprints = Lane()
-        if wp.static(has_footprints):
-            footprints = load_numbers(inputs.footprints[batch], block)
-        return batch, block, ReceiverLanes(load(inputs.points[batch], block), normals, footprints)
+        return batch, block, ReceiverLanes(load(inputs.points[batch], block), normals, Lane())
 
     return load_receivers
 
