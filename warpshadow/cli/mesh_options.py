@@ -25,8 +25,7 @@ SceneOrMesh = Annotated[
 OF_MESHES = "Options of a mesh, which scene files have as keys"
 
 
-_SIZES = ("--width", "--height", "--resolution", "--res")
-"""Options that other programs have for the size of an image."""
+_SIZES = ("--width", "--height", "--resolution", "--res")  # options that other programs have for the size of an image
 
 
 class MeshCommand(typer.core.TyperCommand):

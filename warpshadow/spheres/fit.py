@@ -32,8 +32,7 @@ from warpshadow.spheres.receivers import FitReceivers
 from warpshadow.spheres.refine import DescentState, Refinement
 from warpshadow.spheres.sphere_set import Spheres
 
-ALGORITHM_VERSION = 11
-"""Part of the key of cached fits: raise it whenever a fit would come out differently."""
+ALGORITHM_VERSION = 11  # part of the key of cached fits: raise it whenever a fit would come out differently
 
 COVER_STEPS = 200  # of stage 1 where it is all there is
 STEPS = 320  # of stage 2: 2000 are no better on a bunny

@@ -52,10 +52,8 @@ class Trial(NamedTuple):
 
     scene: Scene
     """The scene with it."""
-    error: float
-    """‖B − B_mesh‖ / ‖B_mesh‖ over points that the camera sees, B the shading."""
-    milliseconds: float
-    """Time of an image; Inf where it is not measured, since the error is too large anyway."""
+    error: float  # ‖B − B_mesh‖ / ‖B_mesh‖ over points that the camera sees, B the shading
+    milliseconds: float  # time of an image; Inf where it is not measured, since the error is too large anyway
 
 
 @dataclass(frozen=True, eq=False)

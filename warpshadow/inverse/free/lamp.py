@@ -15,8 +15,7 @@ from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.maths.directions import fibonacci
 from warpshadow.scene.scene import Scene
 
-STARTS = 8
-"""Directions above the middle of a scene from which the search for a lamp starts."""
+STARTS = 8  # directions above the middle of a scene from which the search for a lamp starts
 
 _REACH = 4.0  # turn [radians], and logarithm of the distance, for a value of 1: a lamp moves farther than a pose
 

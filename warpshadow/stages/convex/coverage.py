@@ -40,18 +40,15 @@ from warpshadow.stages.convex.silhouette import (
 from warpshadow.stages.visibility.culling import DirectionCells, make_cells
 from warpshadow.stages.visibility.directional import SOFTNESS
 
-_PART_COST = 200.0
-"""Mean time of a part of a receiver [ns]."""
+_PART_COST = 200.0  # mean time of a part of a receiver [ns]
 
-_BOUND_MARGIN = 1.001
-"""Bounds are so much larger, for rounding."""
+_BOUND_MARGIN = 1.001  # bounds are so much larger, for rounding
 
 _ON_SURFACE = 3.0e-4
 """Height above a face up to which a receiver lies on it, over the radius of the part: faces are flat to 1e-4. Where the
 part is a chord of a bent surface, its gap is added."""
 
-_ROUNDING = 1.0e-6
-"""The same, over the distance of the part from the origin: several times that of float32."""
+_ROUNDING = 1.0e-6  # the same, over the distance of the part from the origin: several times that of float32
 
 
 @wp.struct
