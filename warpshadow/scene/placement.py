@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 
 from warpshadow.assets.camera import Camera
-from warpshadow.assets.mesh import Mesh
 from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.body import Body
@@ -101,19 +100,16 @@ def enclosures(scene: Scene, cameras: Iterable[Camera]) -> list[str]:
         for number, body in enumerate(scene.bodies):
             low, high = body.mesh.bounds
             eye = body.from_world(camera.eye)
-            if (low < eye).all() and (eye < high).all() and _winding_number(body.mesh, eye) > 0.5:
+            if not ((low < eye).all() and (eye < high).all()):
+                continue
+            corners = body.mesh.positions[body.mesh.faces].astype(np.float64) - eye
+            if solid_angles(corners).sum() > 2 * np.pi:  # a closed one that faces outwards has 4π around points inside
                 place = ", ".join(f"{coordinate:.3g}" for coordinate in camera.eye)
                 return [
                     f"camera: its eye ({place}) is inside body {number} ({body.name!r}), which is "
                     f"{body.scale * (high - low).max():.3g} large; Camera.framing(scene) sees it from outside"
                 ]
     return []
-
-
-def _winding_number(mesh: Mesh, point: np.ndarray) -> float:
-    """How often a mesh goes around a point: 1 inside a closed one that faces outwards."""
-    corners = mesh.positions[mesh.faces].astype(np.float64) - point
-    return float(solid_angles(corners).sum() / (4 * np.pi))
 
 
 def _is_ground(body: Body, box: _Box) -> bool:

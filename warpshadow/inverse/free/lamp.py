@@ -44,17 +44,13 @@ class Lamp(FreeOfBody):
     def start(self, setting: Setting) -> Values:
         return {"turn": setting.tensor(np.zeros(2)), "log_distance": setting.tensor(0.0)}
 
-    def _middle(self, setting: Setting) -> np.ndarray:
-        """Middle of the bodies that do not emit; of those that are not flat, if there are any."""
-        others = [body for body in setting.scene.bodies if not body.is_emitter]
-        solid = [body for body in others if not body.mesh.is_flat]
-        return np.mean([np.mean(body.world_mesh().bounds, axis=0) for body in solid or others], axis=0)
-
     def _start(self, setting: Setting) -> tuple[np.ndarray, np.ndarray, float]:
         """Middle of the others, and from there the direction and the distance of the lamp in the scene."""
 
         def find() -> tuple[np.ndarray, np.ndarray, float]:
-            middle = self._middle(setting)
+            others = [body for body in setting.scene.bodies if not body.is_emitter]
+            solid = [body for body in others if not body.mesh.is_flat]  # which count alone, if there are any
+            middle = np.mean([np.mean(body.world_mesh().bounds, axis=0) for body in solid or others], axis=0)
             offset = setting.scene.bodies[self.number].to_world(setting.middle(self.number)) - middle
             distance = float(np.linalg.norm(offset))
             return middle, (offset / distance if distance > 0 else np.array(constraints.UP)), distance
