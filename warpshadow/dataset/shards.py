@@ -154,9 +154,6 @@ def _add(archive: tarfile.TarFile, number: int, sample: dict[str, bytes]) -> Non
         archive.addfile(member, io.BytesIO(content))
 
 
-# ---------------------------------------------------------------------------------------------- the folder
-
-
 def describe(data_set: DataSet) -> dict[str, Plain]:
     """Everything that decides the bits of the shards, as stored in ``dataset.json``."""
     shards = shards_of(data_set)

@@ -149,8 +149,6 @@ class _Descent:
         if candidate.curvature is not None and isinstance(self.optimizer, QuasiNewton):
             self.optimizer.inherit(candidate.curvature)
 
-    # ---------------------------------------------------------------------------------------- state
-
     def state(self) -> dict[str, Any]:
         """State from which a descent is resumed."""
         return {
@@ -194,8 +192,6 @@ class _Descent:
         self.ended = [_FinishedRun(loss, _copy_values(best, device), *fields) for loss, best, *fields in state["ended"]]
         self.best, self.failure = _copy_values(state["best"], device), state["failure"]
         self.losses, self.descents, self.reason = state["losses"], state["descents"], state["reason"]
-
-    # ---------------------------------------------------------------------------------------- steps
 
     def run(self) -> Iterator[None]:
         """Descend, step by step."""

@@ -146,9 +146,6 @@ def _fit(table: Table, folder: Path) -> Fit:
     return Fit(problem, _stages(table, problem), optimizer, tolerance, seed)
 
 
-# ---------------------------------------------------------------------------------------------- targets
-
-
 def _target(table: Table, folder: Path) -> Target:
     toml_tables.check_table(table)
     check.known_keys("", table, _TARGET_KEYS)
@@ -189,9 +186,6 @@ def _check_framing(path: Path, problem: Problem) -> None:
     )
 
 
-# ---------------------------------------------------------------------------------------------- free parameters
-
-
 def _free(table: Table, scene: Scene) -> list[Free]:
     with check.located("[free]"):
         toml_tables.check_table(table)
@@ -216,9 +210,6 @@ def _free(table: Table, scene: Scene) -> list[Free]:
                 free.append(toml_tables.make(kind, value).numbered(scene))
                 free[-1].check_scene(scene)
     return free
-
-
-# ---------------------------------------------------------------------------------------------- how
 
 
 def _stages(table: Table, problem: Problem) -> tuple[Stage, ...]:

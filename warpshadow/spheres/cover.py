@@ -30,8 +30,6 @@ SURFACE_POINTS = 1024
 SIDE_POINTS = 8192  # of the side from which a mesh is seen, and balls that touch it
 RATE = 0.003  # first learning rate of the centers of 64 spheres or fewer
 
-# ------------------------------------------------------------------------------------------------- start
-
 
 def medial_balls(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> np.ndarray:
     """Balls inside the mesh that touch it at random points, as large as fit: [ball, (x, y, z, radius)].
@@ -102,9 +100,6 @@ def _cover_side(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> n
         picked_balls.append(ball)
         gaps = np.minimum(gaps, np.linalg.norm(points - ball[:3], axis=1) - ball[3])
     return np.array(picked_balls)
-
-
-# ------------------------------------------------------------------------------------------------- descent
 
 
 @wp.kernel(enable_backward=False)

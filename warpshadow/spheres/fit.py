@@ -312,9 +312,6 @@ def _descend(
         yield descent_state.spheres
 
 
-# -------------------------------------------------------------------------------- cache
-
-
 def _cache_path(fit_key: _SphereFitKey, count: int | str) -> Path:
     return cache_path("spheres", fit_key.key(count))
 

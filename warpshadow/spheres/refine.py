@@ -45,8 +45,6 @@ _Bundle = lane_type(FIT_BUNDLE)
 _Sums = wp.types.vector(length=6, dtype=wp.float32)
 _FRAME_ROWS = 12  # numbers that say where a receiver is: its point, and the rows of its frame
 
-# ------------------------------------------------------------------------------------------------- cones
-
 
 @functools.cache
 def _make_frame_axis(lanes: int) -> wp.Function:
@@ -186,9 +184,6 @@ def _make_project_adjoint(lanes: int) -> wp.Kernel:
         )
 
     return project_adjoint
-
-
-# ------------------------------------------------------------------------------------------------- transmittance
 
 
 @wp.kernel(enable_backward=False)

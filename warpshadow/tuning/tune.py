@@ -345,8 +345,6 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
-# ---------------------------------------------------------------------------------------------- "auto"
-
 _resolved: weakref.WeakKeyDictionary[Scene, Scene] = weakref.WeakKeyDictionary()
 
 
@@ -416,9 +414,6 @@ def _settings_by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
 
 def _all_directions(scene: Scene) -> Iterator[Scene]:
     return (replace(scene, visibility=visibility) for visibility in _variants(scene, "directional"))
-
-
-# ---------------------------------------------------------------------------------------------- settings
 
 
 def _trial_scenes(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:

@@ -41,8 +41,6 @@ class FitPage:
         self._pause.on_click(self._pause_or_go_on)
         self._stop.on_click(self._ask_to_stop)
 
-    # ------------------------------------------------------------------------------------------ requests
-
     @property
     def is_watched(self) -> bool:
         """Whether a browser shows it."""
@@ -73,8 +71,6 @@ class FitPage:
         with self._wishes:
             self._stops = True
             self._wishes.notify_all()
-
-    # ------------------------------------------------------------------------------------------ display
 
     def show(self, note: str, losses: Sequence[Sequence[Sequence[float]]], stage: int, candidates: int) -> None:
         """Show how far a fit is, by the losses of the iterations of each descent of each stage."""

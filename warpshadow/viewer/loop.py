@@ -128,8 +128,6 @@ class Loop:
                 client.request_time = self._last_request
         self._changed.notify_all()
 
-    # ------------------------------------------------------------------------------------------ the thread of a page
-
     def _serve(self, client: _Client) -> None:
         frame_rate, last = FrameRate(), None
         while (job := self._next(client, frame_rate, last)) is not None:
