@@ -33,15 +33,11 @@ _MAX_KINDS = 8  # captured at a time: each holds the memory of its call
 
 
 class Replays:
-    """The captured calls of a renderer.
-
-    Attributes:
-        reason: Why the last call was plain; empty if it was replayed.
-    """
+    """The captured calls of a renderer."""
 
     def __init__(self, *, is_on: bool):
         self.is_on = is_on
-        self.reason = "nothing was called yet"
+        self.reason = "nothing was called yet"  # why the last call was plain; empty if it was replayed
         self._kinds: dict[Hashable, _Kind] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -19,16 +19,12 @@ _WIDTH = 760  # of the pictures' panel [CSS pixels]
 
 
 class FitPage:
-    """A page that shows a fit, until it is closed; all browsers share it.
-
-    Attributes:
-        url: Where it is.
-    """
+    """A page that shows a fit, until it is closed; all browsers share it."""
 
     def __init__(self, host: str, port: int):
         check_address(host, port)
         self._server = Server(host, port)
-        self.url = self._server.url
+        self.url = self._server.url  # where it is
         self._wishes = threading.Condition()  # guards the attributes below
         self._pauses = self._stops = False
         gui = self._server.gui
