@@ -31,9 +31,9 @@ from warpshadow.device.parallel import thread_count
 from warpshadow.device.progress import progress_bar
 from warpshadow.device.workers import run_tasks
 from warpshadow.inverse import checkpoint as checkpoints
+from warpshadow.inverse.checkpoint import CHECKPOINT, check_folder, check_writable, has_checkpoint
 from warpshadow.inverse.descent import GOOD_ENDINGS, FitWarning, default_optimizer
 from warpshadow.inverse.fit_file import Fit, load_fit
-from warpshadow.inverse.folder import CHECKPOINT, check_folder, check_writable, has_checkpoint
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.report import Report
 from warpshadow.inverse.schedule import Stage, stages_for
