@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import warpshadow as ws
-from warpshadow.scene.placement import enclosures, misplacements
+from warpshadow.scene.remarks import enclosures, misplacements
 
 LIGHT = np.ones((4, 3))
 GROUND = ws.Body(ws.plane(20.0, 2), name="ground", translation=(0, -1, 0))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
-from warpshadow.scene.shell_light import blurred_shell
+from warpshadow.scene.remarks import blurred_shell
 
 
 def scene_with(light, **options):

@@ -47,17 +47,13 @@ def cached_files(kind: Kind) -> list[Path]:
 
 
 class Unfinished:
-    """Progress of a computation whose result is to be cached; an interrupt leaves it for the next call.
-
-    Attributes:
-        before: Arrays that an interrupted call left; none where the work begins.
-    """
+    """Progress of a computation whose result is to be cached; an interrupt leaves it for the next call."""
 
     def __init__(self, path: Path):
         self._path = path.with_suffix(".part.npz")
         self._arrays: Callable[[], Mapping[str, np.ndarray]] | None = None
         self._done = ""
-        self.before: dict[str, np.ndarray] = {}
+        self.before: dict[str, np.ndarray] = {}  # arrays that an interrupted call left; none where the work begins
         # ignore a damaged file, whatever error it raises
         with (
             contextlib.suppress(Exception),

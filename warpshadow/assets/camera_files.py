@@ -67,16 +67,12 @@ def _read_transforms(path: Path, size: tuple[int, int] | None, near: float) -> d
             values = {key: value for key, value in document.items() if key != "frames"} | frame
             if not isinstance(values.get("file_path"), str):
                 raise ValueError("file_path: missing, expected the path of an image")
-            image = _image_path(path.parent / values["file_path"])
+            image = path.parent / values["file_path"]
+            image = image if image.suffix else image.with_name(f"{image.name}.png")  # which Blender scenes leave out
             if image in result:
                 raise ValueError(f"file_path: got {image} twice, expected it once")
             result[image] = _frame_camera(values, image, size, near)
     return result
-
-
-def _image_path(image: Path) -> Path:
-    """The path of an image; files of the Blender scenes leave out ".png"."""
-    return image if image.suffix else image.with_name(f"{image.name}.png")
 
 
 def _frame_camera(values: Mapping[str, Any], image: Path, size: tuple[int, int] | None, near: float) -> Camera:

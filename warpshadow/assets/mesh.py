@@ -16,20 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from warpshadow import check
-from warpshadow.assets import files
+from warpshadow.assets import files, topology
 from warpshadow.assets.color import linear_to_srgb
-from warpshadow.assets.topology import (
-    CREASE,
-    MeshTopology,
-    creases,
-    draws_lines,
-    is_listed_first,
-    join_at_positions,
-    join_faces,
-    part_at_creases,
-    rounds_edges,
-    smooth_pieces,
-)
 from warpshadow.check import AnyPath
 from warpshadow.maths.adjacency import area_normals
 from warpshadow.maths.convex import ConvexPart, find_convex_parts
@@ -111,7 +99,7 @@ class Mesh:
             checked_arrays["colors"] = reflectances = check.pixels("colors", colors, expected=expected, error=MeshError)
             check.shape("colors", reflectances.shape, (len(vertices), 3))
             check.reflectance("colors", reflectances)
-        is_first = is_listed_first(vertices, indices)
+        is_first = topology.is_listed_first(vertices, indices)
         if not is_first.all():
             check.warn(f"{name}: {np.sum(~is_first)} duplicate faces dropped")
             checked_arrays |= {
@@ -166,9 +154,9 @@ class Mesh:
         return digest.hexdigest()
 
     @functools.cached_property
-    def surface(self) -> MeshTopology:
+    def surface(self) -> topology.MeshTopology:
         """Topology of its faces."""
-        return join_faces(self.positions, self.faces, self.uv_faces)
+        return topology.join_faces(self.positions, self.faces, self.uv_faces)
 
     @functools.cached_property
     def is_flat(self) -> bool:
@@ -221,7 +209,7 @@ class Mesh:
         scale = check.positive("size", size) / (high - low).max() if (high > low).any() else 1.0
         return self.transformed(scale=scale, translation=-scale * (low + high) / 2)
 
-    def creased(self, angle: float = CREASE) -> Mesh:
+    def creased(self, angle: float = topology.CREASE) -> Mesh:
         """Part vertices along sharp edges, so that normals do not round them; spheres are not fitted again.
 
         Where a file has one vertex for all faces of a corner, normals are smooth there: edges turn dark, or bright.
@@ -233,7 +221,7 @@ class Mesh:
         """
         if not (check.is_number(angle) and 0 <= angle <= 180):
             raise MeshError(f"angle: got {check.described(angle)}, expected degrees from 0 to 180")
-        faces, origins = part_at_creases(self.faces, self.surface, self.positions, angle)
+        faces, origins = topology.part_at_creases(self.faces, self.surface, self.positions, angle)
         colors = None if self.colors is None else self.colors[origins]
         return replace(self, positions=self.positions[origins], faces=faces, origins=origins, colors=colors)
 
@@ -245,29 +233,30 @@ class Mesh:
         their numbers: faces refer to the first at each place.
         """
         colors = [] if self.colors is None else [self.colors]
-        return replace(self, faces=join_at_positions(self.positions, self.faces, *colors), origins=None)
+        return replace(self, faces=topology.join_at_positions(self.positions, self.faces, *colors), origins=None)
 
     @functools.cached_property
     def split_count(self) -> int:
         """Count the vertices that :meth:`welded` would join, if normals draw lines over a smooth surface, or 0."""
-        if self.origins is not None or not draws_lines(self.surface, self.positions):  # creased on purpose, or none
+        is_creased = self.origins is not None  # on purpose
+        if is_creased or not topology.draws_lines(self.surface, self.positions):
             return 0
         return len(self._used) - len(self.welded()._used)
 
     @functools.cached_property
     def rounds_edges(self) -> bool:
         """Whether it has many sharp edges whose faces share normals, and looks better :meth:`creased`."""
-        return rounds_edges(self.surface, self.positions)
+        return topology.rounds_edges(self.surface, self.positions)
 
     @functools.cached_property
     def creases(self) -> np.ndarray:
         """Edges across which normals jump, 2ᵏ for that opposite to corner k of each face, int32 of shape [face]."""
-        return creases(self.surface, self.positions)
+        return topology.creases(self.surface, self.positions)
 
     @functools.cached_property
     def smooth_pieces(self) -> np.ndarray:
         """Number of the piece of each face of ``surface``, shape [face]; no sharp edge leads through a piece."""
-        return smooth_pieces(self.surface, self.positions)
+        return topology.smooth_pieces(self.surface, self.positions)
 
     def write(self, path: AnyPath) -> None:
         """Write a Wavefront OBJ file that reads back as the same arrays, bit for bit; colors stand in it as sRGB."""

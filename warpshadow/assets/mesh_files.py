@@ -10,32 +10,13 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeGuard
 import numpy as np
 
 from warpshadow import check
+from warpshadow.assets import gltf, topology
 from warpshadow.assets.color import srgb_to_linear
-from warpshadow.assets.gltf import (
-    NO_FACTORS,
-    Factors,
-    base_color_factor,
-    base_color_factors,
-    cuts_colors,
-    emission_of,
-    emissive_entries,
-    gloss_of,
-    gltf_tree,
-    with_entry,
-)
 from warpshadow.assets.image import read_rgb
 from warpshadow.assets.mesh import BaseColor, Mesh, MeshError, MeshPart, checked_indices, moved_part, turned_over
 from warpshadow.assets.mesh_joining import JoinedMesh, fan, join_parts, joined_normals, weld, with_colors
 from warpshadow.assets.obj import read_items, read_pictures
 from warpshadow.assets.ply import ply_colors, ply_corner_uvs, ply_fault
-from warpshadow.assets.topology import (
-    CREASE,
-    is_listed_first,
-    join_at_positions,
-    join_faces,
-    part_at_creases,
-    rounds_edges,
-)
 from warpshadow.check import AnyPath
 
 if TYPE_CHECKING:  # it is imported where a file is read by it
@@ -201,16 +182,16 @@ def _read_trimesh(path: Path) -> list[MeshPart]:
 
     if path.suffix.lower() == ".ply" and (fault := ply_fault(path.read_bytes())):
         raise MeshError(f"the file is cut off: {fault}")
-    tree = gltf_tree(path) if path.suffix.lower() in (".gltf", ".glb") else {}
+    tree = gltf.gltf_tree(path) if path.suffix.lower() in (".gltf", ".glb") else {}
     loaded_scene = trimesh.load_scene(path, process=False, maintain_order=True, fix_texture=False)
-    parts = _trimesh_parts(loaded_scene, of_file=True, factors=base_color_factors(tree))
-    entries = emissive_entries(tree)
-    parts = [with_entry(part, entries) for part in parts]
+    parts = _trimesh_parts(loaded_scene, of_file=True, factors=gltf.base_color_factors(tree))
+    entries = gltf.emissive_entries(tree)
+    parts = [gltf.with_entry(part, entries) for part in parts]
     if path.suffix.lower() == ".stl":
         if not any(len(part.faces) for part in parts):
             raise MeshError(f"faces: got none, expected at least one triangle{_stl_fault(path.read_bytes())}")
         return [_weld_corners(part) for part in parts]
-    if cuts_colors(tree):
+    if gltf.cuts_colors(tree):
         parts = [part._replace(colors=None, colorless="colors of 16 bits without a material dropped") for part in parts]
     return parts
 
@@ -236,20 +217,20 @@ def _weld_corners(part: MeshPart) -> MeshPart:
     in files of the same mesh without normals.
     """
     vertex_attributes = [] if part.colors is None else [part.colors]
-    is_first = is_listed_first(part.positions, part.faces)  # edges of the others would have too many faces
+    is_first = topology.is_listed_first(part.positions, part.faces)  # edges of the others would have too many faces
     remark = "" if is_first.all() else f"{np.sum(~is_first)} duplicate faces dropped"
     used, faces = np.unique(weld(part.faces[is_first], part.positions, *vertex_attributes), return_inverse=True)
     positions, faces = part.positions[used], faces.reshape(-1, 3)
     colors = None if part.colors is None else part.colors[used]
-    surface = join_faces(positions, faces, None)
-    if rounds_edges(surface, positions):
-        faces, origins = part_at_creases(faces, surface, positions, CREASE)
+    surface = topology.join_faces(positions, faces, None)
+    if topology.rounds_edges(surface, positions):
+        faces, origins = topology.part_at_creases(faces, surface, positions, topology.CREASE)
         positions, colors = positions[origins], None if colors is None else colors[origins]
     return part._replace(positions=positions, faces=faces, colors=colors, remark=remark)
 
 
 def _trimesh_parts(
-    source: trimesh.Trimesh | trimesh.Scene, *, of_file: bool = False, factors: Factors = NO_FACTORS
+    source: trimesh.Trimesh | trimesh.Scene, *, of_file: bool = False, factors: gltf.Factors = gltf.NO_FACTORS
 ) -> list[MeshPart]:
     """The meshes of a scene of trimesh in world space; or one mesh, as it is."""
     import trimesh
@@ -265,12 +246,13 @@ def _trimesh_parts(
     return parts
 
 
-def _trimesh_part(shape, of_file: bool, factors: Factors) -> MeshPart:
+def _trimesh_part(shape, of_file: bool, factors: gltf.Factors) -> MeshPart:
     """Take the arrays of a trimesh.Trimesh, its faces welded across uv seams."""
     material = getattr(shape.visual, "material", None)
     pictures = (_trimesh_picture(material, factors),)
     positions, faces = np.asarray(shape.vertices, np.float32), np.asarray(shape.faces)
-    part = MeshPart(positions, faces, pictures=pictures, gloss=gloss_of(material), emission=emission_of(material))
+    gloss, emission = gltf.gloss_of(material), gltf.emission_of(material)
+    part = MeshPart(positions, faces, pictures=pictures, gloss=gloss, emission=emission)
     part = _trimesh_colored(part, shape, factors)
     corner_uvs = ply_corner_uvs(shape)
     if corner_uvs is not None and len(corner_uvs) == 3 * len(faces):
@@ -281,7 +263,7 @@ def _trimesh_part(shape, of_file: bool, factors: Factors) -> MeshPart:
     keeps_faces = shape.source.file_type in ("glb", "gltf", "stl")  # faces without normals are flat; or welded later
     if normals is None and not keeps_faces and len(faces) and np.isfinite(positions).all():
         checked_faces = checked_indices("faces", faces, len(positions), "vertex")
-        welded_vertices = join_at_positions(positions, checked_faces, *vertex_attributes)
+        welded_vertices = topology.join_at_positions(positions, checked_faces, *vertex_attributes)
     elif uvs is None:
         return part
     else:  # normals of meshes that were changed differ a little at seams
@@ -301,7 +283,7 @@ def _stored_normals(shape: trimesh.Trimesh) -> np.ndarray | None:
     return None if np.allclose(shape.vertex_normals, computed_normals, atol=1e-4) else shape.vertex_normals
 
 
-def _trimesh_colored(part: MeshPart, shape, factors: Factors) -> MeshPart:
+def _trimesh_colored(part: MeshPart, shape, factors: gltf.Factors) -> MeshPart:
     """Give a part the colors that a mesh of trimesh has: of vertices, of faces, or of its material."""
     from trimesh.visual import to_rgba
 
@@ -319,21 +301,21 @@ def _trimesh_colored(part: MeshPart, shape, factors: Factors) -> MeshPart:
     colors = visual.vertex_attributes.get("color", of_ply)
     if colors is not None:
         part = with_colors(part, colors, linear=linear)
-    factor = base_color_factor(visual.material, factors)
+    factor = gltf.base_color_factor(visual.material, factors)
     if factor is None or any(part.pictures) or factor == (1.0, 1.0, 1.0):  # white, glTF's default, says nothing
         return part
     white = np.ones((len(part.positions), 3), np.float32)
     return part._replace(colors=(white if part.colors is None else part.colors) * np.array(factor, np.float32))
 
 
-def _trimesh_picture(material, factors: Factors) -> BaseColor | None:
+def _trimesh_picture(material, factors: gltf.Factors) -> BaseColor | None:
     """The picture of a material, glTF's or a simple one."""
     from trimesh.visual.material import empty_material
 
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is None or image == empty_material().image:  # which trimesh puts where there is none
         return None
-    factor = base_color_factor(material, factors)
+    factor = gltf.base_color_factor(material, factors)
     return BaseColor(image) if factor is None else BaseColor(image, factor)
 
 

@@ -56,9 +56,9 @@ def fit(
     fails costs only itself. Exit status 1: some failed; 3: none did, but some became NaN or Inf.
     """
     from warpshadow.inverse import checkpoint as checkpoints
+    from warpshadow.inverse.checkpoint import CHECKPOINT, PREVIEW, check_folder
     from warpshadow.inverse.descent import GOOD_ENDINGS
     from warpshadow.inverse.fit_file import load_fit
-    from warpshadow.inverse.folder import CHECKPOINT, PREVIEW, check_folder
     from warpshadow.inverse.many import is_of_many
     from warpshadow.inverse.report import SUMMARY, Report, found_values
 
@@ -148,7 +148,7 @@ def _fit_many(fit_path: Path | list[Path], output: Path, view: bool, is_quiet: b
 @contextlib.contextmanager
 def _resumable(folder: Path) -> Iterator[None]:
     """Say how a fit goes on when the user interrupts it."""
-    from warpshadow.inverse.folder import CHECKPOINT, has_checkpoint
+    from warpshadow.inverse.checkpoint import CHECKPOINT, has_checkpoint
 
     try:
         yield

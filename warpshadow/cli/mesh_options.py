@@ -22,11 +22,10 @@ SceneOrMesh = Annotated[
     ),
 ]
 
-OF_MESHES = "Options of a mesh, which scene files have as keys"
+_mesh = functools.partial(typer.Option, rich_help_panel="Options of a mesh, which scene files have as keys")
 
 
-_SIZES = ("--width", "--height", "--resolution", "--res")
-"""Options that other programs have for the size of an image."""
+_SIZES = ("--width", "--height", "--resolution", "--res")  # options that other programs have for the size of an image
 
 
 class MeshCommand(typer.core.TyperCommand):
@@ -65,47 +64,34 @@ class MeshOptions(NamedTuple):
 
     up: Annotated[
         Optional[Literal["y", "z"]],
-        typer.Option(
-            help="Axis that points up; without it, it is guessed by how the mesh stands.", rich_help_panel=OF_MESHES
-        ),
+        _mesh(help="Axis that points up; without it, it is guessed by how the mesh stands."),
     ] = None
     size: Annotated[
         Optional[tuple[str, str]],
-        typer.Option(
+        _mesh(
             help="Width and height of the image, in pixels, or one number for both; without it 512 512.",
-            rich_help_panel=OF_MESHES,
             metavar="WIDTH HEIGHT",
             callback=_two_numbers,
         ),
     ] = None
     albedo: Annotated[
         Optional[tuple[float, float, float]],
-        typer.Option(
+        _mesh(
             help="Reflectance of the mesh, linear, each from 0 to 1, in place of the file's texture and colors.",
-            rich_help_panel=OF_MESHES,
             metavar="R G B",
         ),
     ] = None
-    light: Annotated[
-        Optional[Path],
-        typer.Option(help="File of an environment map, .exr or .hdr, in place of a sky.", rich_help_panel=OF_MESHES),
-    ] = None
+    light: Annotated[Optional[Path], _mesh(help="File of an environment map, .exr or .hdr, in place of a sky.")] = None
     direction: Annotated[
         Optional[tuple[float, float, float]],
-        typer.Option(
+        _mesh(
             help="Where the camera stands, seen from the mesh's middle, y up; without it 0.3 0.4 0.9; from behind it "
             "is 0.3 0.4 -0.9.",
-            rich_help_panel=OF_MESHES,
             metavar="X Y Z",
         ),
     ] = None
     light_rotation: Annotated[
-        Optional[float],
-        typer.Option(
-            help="Turn the light, counterclockwise seen from above, in degrees.",
-            metavar="DEGREES",
-            rich_help_panel=OF_MESHES,
-        ),
+        Optional[float], _mesh(help="Turn the light, counterclockwise seen from above, in degrees.", metavar="DEGREES")
     ] = None
 
 

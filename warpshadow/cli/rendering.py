@@ -1,5 +1,6 @@
 """Images and videos: render."""
 
+import functools
 import itertools
 import time
 from collections.abc import Iterator
@@ -27,7 +28,10 @@ from warpshadow.cli.mesh_options import (
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import AUTO, METHOD_TRAITS
 
-_PICTURES, _VIDEOS, _METHOD = "Pictures", "Videos", "Method, in place of the scene's"  # panels of the help
+_of_pictures, _of_videos, _of_method = (  # options, by panels of the help
+    functools.partial(typer.Option, rich_help_panel=panel)
+    for panel in ("Pictures", "Videos", "Method, in place of the scene's")
+)
 _BACKGROUNDS = ("transparent", "environment")  # beside colors
 
 
@@ -60,53 +64,37 @@ def render(
         ),
     ],
     mesh_options: MeshOptions,
-    png: Annotated[
-        Optional[Path],
-        typer.Option(help="Beside an .exr, also write a picture: .png, or .jpg.", rich_help_panel=_PICTURES),
-    ] = None,
+    png: Annotated[Optional[Path], _of_pictures(help="Beside an .exr, also write a picture: .png, or .jpg.")] = None,
     exposure: Annotated[
-        Optional[float],
-        typer.Option(help="Exposure in stops; without it the brightest 1% just saturate.", rich_help_panel=_PICTURES),
+        Optional[float], _of_pictures(help="Exposure in stops; without it the brightest 1% just saturate.")
     ] = None,
     tone: Annotated[
-        Literal["clip", "filmic"],
-        typer.Option(help="Tone curve of bright color: cut off, or bent.", rich_help_panel=_PICTURES),
+        Literal["clip", "filmic"], _of_pictures(help="Tone curve of bright color: cut off, or bent.")
     ] = "clip",
     background: Annotated[
         str,
-        typer.Option(
+        _of_pictures(
             help="Background of the picture or video: environment, a color (white, #ffcc00), or transparent, which "
-            ".jpg files and videos show as white.",
-            rich_help_panel=_PICTURES,
+            ".jpg files and videos show as white."
         ),
     ] = "transparent",
     turntable: Annotated[
-        Optional[int],
-        typer.Option(
-            help="Write a video of so many frames in which the camera goes around.", min=1, rich_help_panel=_VIDEOS
-        ),
+        Optional[int], _of_videos(help="Write a video of so many frames in which the camera goes around.", min=1)
     ] = None,
     fps: Annotated[
         Optional[float],
-        typer.Option(
-            help="Frames a second of a turntable, 24 by default; 0.1 to 1000, of .webp 90, of .gif 50.",
-            rich_help_panel=_VIDEOS,
-        ),
+        _of_videos(help="Frames a second of a turntable, 24 by default; 0.1 to 1000, of .webp 90, of .gif 50."),
     ] = None,
     camera_path: Annotated[
         Optional[Path],
-        typer.Option(
-            help="Write a video along the keyframes of a TOML file, whose keys warpshadow/cli/README.md lists.",
-            rich_help_panel=_VIDEOS,
-        ),
+        _of_videos(help="Write a video along the keyframes of a TOML file, whose keys warpshadow/cli/README.md lists."),
     ] = None,
     stills: Annotated[
         bool,
-        typer.Option(
+        _of_videos(
             "--stills",
             help="Render each frame of a video as an image alone: by rays, if the scene names no method. Shadows are "
             "better, and nothing is prepared, but each frame takes two to three times as long.",
-            rich_help_panel=_VIDEOS,
         ),
     ] = False,
     layers: Annotated[
@@ -119,27 +107,17 @@ def render(
     ] = False,
     method: Annotated[
         Any,
-        typer.Option(
+        _of_method(
             help="How visibility is computed; ray-traced, the reference, is a path tracer where light bounces.",
-            rich_help_panel=_METHOD,
             parser=method_of_visibility,
             metavar="|".join(METHOD_TRAITS),
         ),
     ] = None,
     samples: Annotated[
-        Optional[int],
-        typer.Option(
-            help="Of ray-traced: rays of a pixel, and with bounces half as many paths.", min=1, rich_help_panel=_METHOD
-        ),
+        Optional[int], _of_method(help="Of ray-traced: rays of a pixel, and with bounces half as many paths.", min=1)
     ] = None,
     bounces: Annotated[
-        Any,
-        typer.Option(
-            help="How often light bounces, 0 to 16 or all.",
-            rich_help_panel=_METHOD,
-            parser=count_of_bounces,
-            metavar="INTEGER|all",
-        ),
+        Any, _of_method(help="How often light bounces, 0 to 16 or all.", parser=count_of_bounces, metavar="INTEGER|all")
     ] = None,
     device: Device = "cpu",
     is_quiet: Quiet = False,

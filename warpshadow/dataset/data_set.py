@@ -140,9 +140,6 @@ def _split_of(recipe: Recipe, content: str) -> str:
     )
 
 
-# ---------------------------------------------------------------------------------------------- files
-
-
 class _LazyFiles(Sequence[Item], Generic[Item]):
     """Files of a folder, each read when it is asked for."""
 

@@ -49,9 +49,6 @@ def _as_channels(names: Sequence[str], values: np.ndarray) -> Channels:
     return dict(zip(names, np.moveaxis(values, -1, 0), strict=True))
 
 
-# ---------------------------------------------------------------------------------------------- the table
-
-
 class Layer(NamedTuple):
     """A layer of pixels."""
 

@@ -143,9 +143,6 @@ def _numbers(values: np.ndarray) -> Plain:
     return [_numbers(row) for row in values] if values.ndim else float(str(values))
 
 
-# ---------------------------------------------------------------------------------------------- reading
-
-
 def read_shard(path: AnyPath) -> Iterator[Sample]:
     """Read the samples of a shard, one after another.
 

@@ -74,7 +74,9 @@ def write_shards(
         _prepare_folder(folder, describe(data_set))
         missing_shards = [shard for shard in shards if not (folder / shard.name).exists()]
         numbers = [number for shard in missing_shards for number in shard.numbers]
-        rendered_images, warned_kinds = _render_all(data_set, numbers, _worker_count(data_set, workers)), set[str]()
+        default = thread_count() if data_set.device == "cpu" else 1
+        count = default if workers is None else check.integer("workers", workers, unit="processes")
+        rendered_images, warned_kinds = _render_all(data_set, numbers, count), set[str]()
         with (
             contextlib.closing(rendered_images),
             progress_bar(len(numbers), "rendering", "image", shows=progress) as bar,
@@ -87,12 +89,6 @@ def write_shards(
                         _add(archive, number, sample)
                         bar.update()
     return [folder / shard.name for shard in shards]
-
-
-def _worker_count(data_set: DataSet, workers: int | None) -> int:
-    if workers is not None:
-        return check.integer("workers", workers, unit="processes")
-    return thread_count() if data_set.device == "cpu" else 1
 
 
 class _Rendered(NamedTuple):
@@ -156,9 +152,6 @@ def _add(archive: tarfile.TarFile, number: int, sample: dict[str, bytes]) -> Non
         member = tarfile.TarInfo(f"{number:09d}.{ending}")  # of no user, and of 1970: always the same bits
         member.size = len(content)
         archive.addfile(member, io.BytesIO(content))
-
-
-# ---------------------------------------------------------------------------------------------- the folder
 
 
 def describe(data_set: DataSet) -> dict[str, Plain]:

@@ -70,8 +70,7 @@ if "inline" not in inspect.signature(wp.func).parameters:  # Warp 1.17, whose co
 
 _types = wp._src.types
 
-BLOCK_DIM = 64
-"""Threads of a block on CUDA: with few a block, some thousand receivers reach all multiprocessors."""
+BLOCK_DIM = 64  # threads of a block on CUDA: with few a block, some thousand receivers reach all multiprocessors
 
 _MAX_STRIDE = 2**31 - 1  # bytes from one item of an axis to the next
 

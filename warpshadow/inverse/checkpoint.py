@@ -1,4 +1,4 @@
-"""Checkpoints: the state of a long computation in a file that is whole or not there.
+"""Checkpoints: the state of a long computation in a file that is whole or not there; and the folder of a fit.
 
 A file holds a mark, the SHA-256 of the payload, and the payload in torch's own format. It replaces the one before by a
 rename, and that one is kept beside it, so whenever a process is killed a whole file remains.
@@ -17,6 +17,8 @@ import torch
 from warpshadow import check
 from warpshadow.assets import files
 from warpshadow.check import AnyPath
+
+CHECKPOINT, PREVIEW = "checkpoint", "preview.png"  # files in the folder of a fit
 
 OTHER_FILE_REMEDY = "choose another file, which on the command line is another folder by -o"
 """Remedy for messages about an unusable checkpoint."""
@@ -116,3 +118,25 @@ def _state(path: Path, payload: bytes) -> dict[str, Any]:
 def previous_path(path: Path) -> Path:
     """Path of the previous checkpoint."""
     return path.with_name(f"{path.name}.previous")
+
+
+def check_writable(path: Path) -> None:
+    """Raise OSError unless a folder can be written into, or made."""
+    if path.exists() and not path.is_dir():
+        raise NotADirectoryError(f"{path}: got a file, expected a folder")
+    files.check_folder(path if path.is_dir() else path.parent)
+
+
+def check_folder(path: Path) -> None:
+    """Raise OSError unless a folder is new, or that of a fit."""
+    check_writable(path)
+    if not path.is_dir() or has_checkpoint(path):
+        return
+    others = sorted(item.name for item in path.iterdir() if not item.name.startswith(".") and item.name != PREVIEW)
+    if others:
+        raise FileExistsError(f"{path}: got a folder with {others[0]} in it, expected a new one or that of this fit")
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Whether a fit in a folder can go on."""
+    return any(folder.glob(f"{CHECKPOINT}*"))

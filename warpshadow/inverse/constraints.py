@@ -204,9 +204,6 @@ def turn_onto(source: np.ndarray, goal: np.ndarray) -> np.ndarray:
     return Rotation.from_rotvec(np.arctan2(sine, cosine) * axis / np.linalg.norm(axis)).as_matrix()
 
 
-# ------------------------------------------------------------------------------------------------ arguments
-
-
 def checked_axis(value: object) -> tuple[float, ...]:
     """A unit vector, of a direction of any length."""
     axis = check.array("axis", value, (3,), "a direction")

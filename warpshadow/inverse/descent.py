@@ -18,15 +18,14 @@ from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.diagnostics import warn_before, warn_of
 from warpshadow.inverse.free.base import Free, Values
 from warpshadow.inverse.free.lamp import Lamp
-from warpshadow.inverse.one_thread import torch_on_one_thread
-from warpshadow.inverse.preview import write_preview
+from warpshadow.inverse.model import torch_on_one_thread
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import Curvature, QuasiNewton
 from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage, check_part, stages_for
 from warpshadow.inverse.uncertainty import candidates_along_flat_direction
 from warpshadow.inverse.variable_projection import make_model
-from warpshadow.inverse.watch import Watch, watching
+from warpshadow.inverse.watch import Watch, watching, write_preview
 from warpshadow.viewer import FitViewer
 
 MAX_QUASI_NEWTON_VALUES = 100  # up to how many values are found by quasi-Newton steps unless an optimizer is named
@@ -149,8 +148,6 @@ class _Descent:
         if candidate.curvature is not None and isinstance(self.optimizer, QuasiNewton):
             self.optimizer.inherit(candidate.curvature)
 
-    # ---------------------------------------------------------------------------------------- state
-
     def state(self) -> dict[str, Any]:
         """State from which a descent is resumed."""
         return {
@@ -194,8 +191,6 @@ class _Descent:
         self.ended = [_FinishedRun(loss, _copy_values(best, device), *fields) for loss, best, *fields in state["ended"]]
         self.best, self.failure = _copy_values(state["best"], device), state["failure"]
         self.losses, self.descents, self.reason = state["losses"], state["descents"], state["reason"]
-
-    # ---------------------------------------------------------------------------------------- steps
 
     def run(self) -> Iterator[None]:
         """Descend, step by step."""

@@ -27,8 +27,7 @@ MAX_EXPLAINED_SHARE = 0.5  # part of the residual's squares that a factor of an 
 MIN_EXPOSURE_GAP = 0.2
 """Logarithm to the base 2 of the factor from which that is of interest; a wrong pose has one, too."""
 
-MAX_IMAGE_ERROR = 0.25
-"""Error of images that is poor: a pose in a wrong minimum has 0.34, and where it is found 0.02."""
+MAX_IMAGE_ERROR = 0.25  # error of images that is poor: a pose in a wrong minimum has 0.34, and where it is found 0.02
 
 _WINDOW = 20  # iterations, of which the second half is compared with the first
 _SIDE = 96  # shorter side of small images [pixels]

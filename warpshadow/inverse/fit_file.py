@@ -35,7 +35,7 @@ from warpshadow.inverse.schedule import READY_STAGES, Stage, check_stages
 from warpshadow.inverse.target import Target
 from warpshadow.scene import toml_tables
 from warpshadow.scene.files import load_scene, parse_camera
-from warpshadow.scene.scene import BodyLike, Scene
+from warpshadow.scene.scene import Scene
 from warpshadow.scene.toml_tables import Table
 from warpshadow.scene.visibility import Visibility
 
@@ -50,13 +50,9 @@ _FREE_OF_BODIES: dict[str, type[Free]] = {
 }
 
 
-def _pair(key: str, value: object) -> tuple[float, ...]:
-    return tuple(check.array(key, value, (2,)).tolist())
-
-
 _OPTIMIZERS: dict[str, tuple[Callable[..., torch.optim.Optimizer], dict[str, Callable[[str, object], Any]]]] = {
     "quasi-newton": (QuasiNewton, {}),
-    "adam": (torch.optim.Adam, {"betas": _pair}),
+    "adam": (torch.optim.Adam, {"betas": lambda key, value: tuple(check.array(key, value, (2,)).tolist())}),
     "sgd": (torch.optim.SGD, {"momentum": check.number, "dampening": check.number, "nesterov": check.flag}),
     "rmsprop": (torch.optim.RMSprop, {"alpha": check.number, "eps": check.number, "momentum": check.number}),
     "lbfgs": (
@@ -150,9 +146,6 @@ def _fit(table: Table, folder: Path) -> Fit:
     return Fit(problem, _stages(table, problem), optimizer, tolerance, seed)
 
 
-# ---------------------------------------------------------------------------------------------- targets
-
-
 def _target(table: Table, folder: Path) -> Target:
     toml_tables.check_table(table)
     check.known_keys("", table, _TARGET_KEYS)
@@ -165,18 +158,13 @@ def _target(table: Table, folder: Path) -> Target:
     if "outlines" in table:
         with check.located("outlines"):
             toml_tables.check_table(table["outlines"])
-            files = table["outlines"]
-            options["outlines"] = {_body(name): toml_tables.file(files, name, folder) for name in files}
+            files = {key: toml_tables.file(table["outlines"], key, folder) for key in table["outlines"]}
+            options["outlines"] = {int(key) if key.isdecimal() else key: file for key, file in files.items()}
     if "camera" in table:
         with check.located("camera"):
             toml_tables.check_table(table["camera"])
             options["camera"] = parse_camera({"size": image_size(path)} | table["camera"])
     return Target(path, **options)
-
-
-def _body(key: str) -> BodyLike:
-    """A body's number, where a key is one; or its name."""
-    return int(key) if key.isdecimal() else key
 
 
 def _check_framing(path: Path, problem: Problem) -> None:
@@ -196,9 +184,6 @@ def _check_framing(path: Path, problem: Problem) -> None:
         "elsewhere, and framed otherwise, when the images were made. In place of framing, direction and margin write "
         f"eye and target, the same as of the images; of this file they are\neye = {eye}\ntarget = {target}"
     )
-
-
-# ---------------------------------------------------------------------------------------------- free parameters
 
 
 def _free(table: Table, scene: Scene) -> list[Free]:
@@ -225,9 +210,6 @@ def _free(table: Table, scene: Scene) -> list[Free]:
                 free.append(toml_tables.make(kind, value).numbered(scene))
                 free[-1].check_scene(scene)
     return free
-
-
-# ---------------------------------------------------------------------------------------------- how
 
 
 def _stages(table: Table, problem: Problem) -> tuple[Stage, ...]:

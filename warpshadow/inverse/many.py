@@ -31,9 +31,9 @@ from warpshadow.device.parallel import thread_count
 from warpshadow.device.progress import progress_bar
 from warpshadow.device.workers import run_tasks
 from warpshadow.inverse import checkpoint as checkpoints
+from warpshadow.inverse.checkpoint import CHECKPOINT, check_folder, check_writable, has_checkpoint
 from warpshadow.inverse.descent import GOOD_ENDINGS, FitWarning, default_optimizer
 from warpshadow.inverse.fit_file import Fit, load_fit
-from warpshadow.inverse.folder import CHECKPOINT, check_folder, check_writable, has_checkpoint
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.report import Report
 from warpshadow.inverse.schedule import Stage, stages_for
@@ -178,9 +178,6 @@ def fit_many(
     return ordered_endings
 
 
-# ------------------------------------------------------------------------------------------------ one of them
-
-
 @dataclass(frozen=True)
 class _FitJob:
     """One of many fits, as it is sent to a worker."""
@@ -302,9 +299,6 @@ def _run_fit(job: _FitJob) -> Ending:
     )
 
 
-# ------------------------------------------------------------------------------------------------ the table
-
-
 def write_table(endings: Sequence[Ending], path: AnyPath) -> None:
     """Write how fits ended as CSV, a row for each; parameters of several numbers have a column for each number."""
     rows = []
@@ -319,9 +313,6 @@ def write_table(endings: Sequence[Ending], path: AnyPath) -> None:
         writer = csv.DictWriter(file, [*columns, "warnings"])
         writer.writeheader()
         writer.writerows(rows)
-
-
-# ------------------------------------------------------------------------------------------------ names
 
 
 def is_of_many(where: AnyPath) -> bool:

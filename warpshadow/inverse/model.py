@@ -1,6 +1,7 @@
 """Models: the images of a problem, and their loss, as functions of the free parameters."""
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import torch
@@ -139,3 +140,17 @@ def _product(rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
     """A product of matrices in float64, some pixels at a time, so that no copy of all is made."""
     parts = zip(rows.split(_PIXELS_AT_ONCE, dim=1), columns.split(_PIXELS_AT_ONCE), strict=True)
     return torch.stack([row.double() @ column.double() for row, column in parts]).sum(dim=0)
+
+
+@contextlib.contextmanager
+def torch_on_one_thread() -> Iterator[None]:
+    """Let torch compute on the calling thread alone, so that a fit is the same to the bit on any number of cores.
+
+    Its sums depend on how many threads share them. Kernels keep their threads, on which results do not depend.
+    """
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)

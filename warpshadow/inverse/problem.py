@@ -174,17 +174,14 @@ class Problem:
         scene = replace(self.scene, camera=cameras[0], visibility=self.visibility)
         if scene.visibility.method in SPHERE_METHODS:  # another one would leave the found scene without its blockers
             spheres = scene_blockers(scene, device=str(device), progress=progress)
-            numbers = set(range(len(spheres))) - self._planes(scene)
+            # bodies that block light as planes do so in the scene that is found, too
+            reshaped = {free.number for free in (*self.free_of(Deformation), *self.free_of(Radii))}
+            numbers = set(range(len(spheres))) - (set(blocking_planes(scene)) - reshaped)
             scene = change_bodies(scene, "blockers", {number: spheres[number] for number in numbers})
         color = np.stack([target.image[..., :3] for target in self.targets]).astype(np.float64)
         weights = np.stack([target.weights() for target in self.targets])[..., None]
         unit = float(np.sqrt((weights * color**2).sum() / (3 * weights.sum())))
         return Setting(scene, cameras, unit or 1.0, device)
-
-    def _planes(self, scene: Scene) -> set[int]:
-        """Bodies that block light as planes, not by spheres, also in the scene that is found."""
-        reshaped = {free.number for free in (*self.free_of(Deformation), *self.free_of(Radii))}
-        return set(blocking_planes(scene)) - reshaped
 
     def start(self, setting: Setting) -> dict[str, Values]:
         """The scene's values of the free parameters, by name."""

@@ -131,7 +131,8 @@ class QuasiNewton(torch.optim.Optimizer):
         )
         slope, length, *products = _read_numbers(*numbers)
         if _has_positive_curvature(*products):
-            self._add_curvature_pair(step, change)
+            steps, changes = self.curvature
+            memory["steps"], memory["changes"] = [*steps, step][-HISTORY:], [*changes, change][-HISTORY:]
         loss_increase = loss - memory["loss"]
         if loss_increase >= 0 and length > 0:
             # of the parabola through both
@@ -143,12 +144,6 @@ class QuasiNewton(torch.optim.Optimizer):
             memory["bound"] = min(_BOUND_GROWTH * memory["bound"], _MAX_BOUND * self._rate)
         memory["gained"] = -loss_increase
         self._keep(loss, place, gradient, self._clamped_sides(place))
-
-    def _add_curvature_pair(self, step: torch.Tensor, change: torch.Tensor) -> None:
-        """Add a step and how the gradient changed over it."""
-        memory = self._memory
-        steps, changes = self.curvature
-        memory["steps"], memory["changes"] = [*steps, step][-HISTORY:], [*changes, change][-HISTORY:]
 
     def _direction(self) -> torch.Tensor:
         """Quasi-Newton direction: minus the gradient times the inverse curvature estimated from the steps.

@@ -125,9 +125,6 @@ def check_stages(stages: Sequence[Stage], problem: Problem) -> None:
             raise ValueError(f"stages[{number}]: {error}") from error
 
 
-# ------------------------------------------------------------------------------------------------ ways that work
-
-
 def pose_stages(problem: Problem) -> tuple[Stage, ...]:
     """Find a pose from 10° to 40° and a quarter of the body away.
 

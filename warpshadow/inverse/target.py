@@ -99,7 +99,8 @@ class Target:
         object.__setattr__(self, "outlines", _outlines(outlines or {}, image.shape[:2]))
         check.flag("moves_outlines", moves_outlines)
         if moves_outlines:
-            self.outlines.update({body: _at_edges(image, outline) for body, outline in self.outlines.items()})
+            colors = np.nan_to_num(image[..., :3])
+            self.outlines.update({body: moved_outline(o, edge_offset(colors, o)) for body, o in self.outlines.items()})
         if self.mask is not None:
             image[self.mask == 0] = 0  # whatever the value
         size = image.shape[1], image.shape[0]
@@ -172,10 +173,6 @@ def _outlines(
             check.finite("mask", mask, minimum=0, maximum=1)
         masks[body] = mask
     return masks
-
-
-def _at_edges(image: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    return moved_outline(outline, edge_offset(np.nan_to_num(image[..., :3]), outline))
 
 
 def _gains(white_balance: npt.ArrayLike | None) -> np.ndarray:

@@ -101,16 +101,7 @@ class Setting:
 class World:
     """A scene on its way to an image; each free parameter replaces the scene's values with its tensors.
 
-    Attributes:
-        light, albedo, textures: As :class:`warpshadow.torch.TorchRenderer` takes them.
-        gloss: Its roughness and the like, by name.
-        emission, shell: As it takes them.
-        rotations, translations, scales: Of each body.
-        rest: The bodies in their own spaces, None for the scene's.
-        moving: Bodies that do not stand where the scene has them.
-        clip_matrices: Of the views, [view, 4, 4], None for the scene's.
-        exposures: Factors of the views' colors, [view, 1] or [view, 3], None for 1.
-        outline_offsets: By how much painted outlines lie inside the true ones [pixels of targets], [view], None for 0.
+    All are as :class:`warpshadow.torch.TorchRenderer` takes them, None for the scene's own; poses are of each body.
     """
 
     def __init__(self, renderer: TorchRenderer, cameras: Sequence[Camera]):
@@ -124,11 +115,11 @@ class World:
         self.emission: list[torch.Tensor | None] = [None] * count
         self.shell: torch.Tensor | None = None
         self.rotations, self.translations, self.scales = (list(poses.unbind()) for poses in renderer.scene_poses())
-        self.rest: Geometry | None = None
-        self.moving: set[int] = set()
-        self.clip_matrices: torch.Tensor | None = None
-        self.exposures: torch.Tensor | None = None
-        self.outline_offsets: torch.Tensor | None = None
+        self.rest: Geometry | None = None  # the bodies in their own spaces
+        self.moving: set[int] = set()  # bodies that do not stand where the scene has them
+        self.clip_matrices: torch.Tensor | None = None  # of the views, [view, 4, 4]
+        self.exposures: torch.Tensor | None = None  # factors of colors, [view, 1] or [view, 3], None for 1
+        self.outline_offsets: torch.Tensor | None = None  # inwards [pixels of targets], [view], None for 0
 
     @functools.cached_property
     def geometry(self) -> Geometry | None:

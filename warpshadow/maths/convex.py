@@ -15,16 +15,14 @@ from warpshadow.maths.panels import MAX_FLAT_PANELS_OF, MAX_PANELS_OF, find_pane
 from warpshadow.maths.shells import find_layer
 from warpshadow.maths.tubes import MAX_SEGMENTS, find_tube
 
-MAX_FACES = 64
-"""Faces of a part at most; a cylinder of 48 sides has 50."""
+MAX_FACES = 64  # faces of a part at most; a cylinder of 48 sides has 50
 
 MAX_PRISMS = 32
 """Prisms into which a piece is cut at most. A gear with five round holes has 300: as many spheres are faster."""
 
 _MAX_AXES = 8  # directions in which a piece may be a prism, of its largest faces
 
-_MAX_TRIANGLES = 16 * MAX_FACES
-"""Triangles of a solid at most: its faces may be divided."""
+_MAX_TRIANGLES = 16 * MAX_FACES  # triangles of a solid at most: its faces may be divided
 
 _FLATNESS = 1e-4
 """Height over the size of the part up to which vertices lie in the plane of a face, and on a straight edge; and
@@ -39,16 +37,13 @@ _TWIST = 5e-3  # the same of faces of segments of bent tubes, whose sides twist
 class ConvexPart(NamedTuple):
     """A closed convex piece of a mesh, without the edges inside its faces; or a panel, whose faces are its sides."""
 
-    corners: np.ndarray
-    """Vertices of the mesh at its corners, int of shape [corner]."""
+    corners: np.ndarray  # vertices of the mesh at its corners, int of shape [corner]
     faces: np.ndarray
     """Three corners of each face, counterclockwise from outside, numbers among the corners, shape [face, 3]."""
-    edges: np.ndarray
-    """Ends of each edge, indices of corners, and the faces to its left and right, [edge, 4]."""
+    edges: np.ndarray  # ends of each edge, indices of corners, and the faces to its left and right, [edge, 4]
     is_seam: bool = False
     """Whether it is the face that two prisms share: seen at a slant both cover it, so it is to be taken off."""
-    piece: int = 0
-    """Number of the piece of the mesh, from 0. Parts of one piece are beside each other."""
+    piece: int = 0  # number of the piece of the mesh, from 0. Parts of one piece are beside each other.
     gap: float = 0.0
     """Distance of the mesh from a part that stands in for a bent piece of it, at most, over the radius of the part."""
 

@@ -13,12 +13,10 @@ _SLIVER = 0.1
 """Height over the longest side of a triangle below which a collapse may leave it only if it is more than half of that
 before."""
 
-_RIM_WEIGHT = 0.1
-"""Weight of planes upright on the rim. With 1 a shell whose rim has many teeth has a panel at each."""
+_RIM_WEIGHT = 0.1  # weight of planes upright on the rim. With 1 a shell whose rim has many teeth has a panel at each.
 
 _TIE = 1e-6  # part of the squared length of an edge in its cost: of edges in a plane, short ones collapse first
-_MAX_POINTS = 4096
-"""Vertices at most with which collapses begin: 20 000 triangles take a second."""
+_MAX_POINTS = 4096  # vertices at most with which collapses begin: 20 000 triangles take a second
 
 _ROUNDS_OF_CHOICE = 3  # in which collapses far from each other are chosen: more find few more
 

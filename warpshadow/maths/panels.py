@@ -18,8 +18,7 @@ bowl of a thin wall, 128² pixels, light is off by 2.2% with 0.02 (131 panels), 
 (361), 3.9% by 1024 spheres, and an iteration of its pose takes 0.27, 0.36, 0.43, 0.19 s of CPU time. A mug's has
 corners at its foot with more than 0.007. A bunny would have 190 with 0.04, and has spheres."""
 
-MAX_FLAT_PANELS_OF = {1e-3: 64}
-"""Deviation and number for flat panels, which shade nothing that lies on the mesh."""
+MAX_FLAT_PANELS_OF = {1e-3: 64}  # deviation and number for flat panels, which shade nothing that lies on the mesh
 
 _MAX_SCALE = 2.0
 """Scale of a sheet over its extent at most. The scale is the geometric mean of the extents of the sheet and the mesh:

@@ -9,11 +9,9 @@ import numpy as np
 
 from warpshadow.maths.adjacency import area_normals, edges_of
 
-SLACK = 0.2
-"""Distance of a corner of a tube from its straight segments at most, over the radius of its section."""
+SLACK = 0.2  # distance of a corner of a tube from its straight segments at most, over the radius of its section
 
-MAX_SEGMENTS = 128
-"""Segments of the tubes of a mesh at most: beyond, spheres are faster."""
+MAX_SEGMENTS = 128  # segments of the tubes of a mesh at most: beyond, spheres are faster
 
 _MAX_BEND = 0.95
 """Cosine of the angle between neighboring segments at least, 18°: with 30° shadows of rings had corners."""
@@ -31,10 +29,8 @@ class Tube(NamedTuple):
     sections: np.ndarray
     """Vertices around it between segments and at its ends, those beside each other in one column, int of shape
     [segment + 1, corner]: of a closed tube the last are the first."""
-    segments: list[np.ndarray]
-    """Triangles of the convex hull of two sections, which wind alike, [triangle, 3]."""
-    gaps: np.ndarray
-    """Largest distance of the surface from each segment [units of points], shape [segment]."""
+    segments: list[np.ndarray]  # triangles of the convex hull of two sections, which wind alike, [triangle, 3]
+    gaps: np.ndarray  # largest distance of the surface from each segment [units of points], shape [segment]
 
 
 class _Ring(NamedTuple):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -225,7 +226,7 @@ class Body:
             ("albedo", _read_colors, COLORS_SUFFIX, ValueError),
             ("emission", _read_colors, COLORS_SUFFIX, ValueError),
             ("blockers", Spheres.read, _SPHERES_SUFFIX, ValueError),
-            *((name, _read_values, VALUES_SUFFIX, ValueError) for name in GLOSS_ARGUMENTS),
+            *((name, partial(_read_colors, shape="[vertex]"), VALUES_SUFFIX, ValueError) for name in GLOSS_ARGUMENTS),
         )
         for name, read, suffix, error in readers:
             value = getattr(self, name)
@@ -427,10 +428,6 @@ def _read_colors(path: Path, shape: str = "[vertex, 3]") -> np.ndarray:
         return np.load(path, allow_pickle=False)
     except (ValueError, EOFError) as error:
         raise ValueError(f"got {path} ({error}), expected an .npy file of {shape}") from error
-
-
-def _read_values(path: Path) -> np.ndarray:
-    return _read_colors(path, "[vertex]")
 
 
 def _css_color_hint(color: str) -> str:

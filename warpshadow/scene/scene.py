@@ -225,24 +225,20 @@ class Scene:
 
     def _check_method(self) -> None:
         """Raise ValueError for bodies, light and bounces that the named method does not show."""
-        glossy = next((body for body in self.bodies if body.is_glossy), None)
-        if glossy is not None and not self.visibility.traits.shows_all_light:
-            raise ValueError(
-                f"roughness: got some for body {glossy.name!r}, which {self.visibility.method!r} does not show, "
-                f"expected None, or method = one of {', '.join(map(repr, FULL_LIGHT_METHODS))}"
-            )
-        emitter = next((body for body in self.bodies if body.is_emitter), None)
-        if emitter is not None and not self.visibility.traits.shows_all_light:
-            raise ValueError(
-                f"emission: got some for body {emitter.name!r}, whose light {self.visibility.method!r} lacks, "
-                f"expected None, or method = one of {', '.join(map(repr, FULL_LIGHT_METHODS))}"
-            )
+        method, methods = repr(self.visibility.method), ", ".join(map(repr, FULL_LIGHT_METHODS))
+        glossy = [body.name for body in self.bodies if body.is_glossy]
+        emitters = [body.name for body in self.bodies if body.is_emitter]
+        lacks = [
+            f"roughness: got some for body {name!r}, which {method} does not show, expected None" for name in glossy
+        ]
+        lacks += [
+            f"emission: got some for body {name!r}, whose light {method} lacks, expected None" for name in emitters
+        ]
         if self.shell is not None:
-            if not self.visibility.traits.shows_all_light:
-                raise ValueError(
-                    f"light: got a radius, which {self.visibility.method!r} does not know, expected a map without one, "
-                    f"or method = one of {', '.join(map(repr, FULL_LIGHT_METHODS))}"
-                )
+            lacks.append(f"light: got a radius, which {method} does not know, expected a map without one")
+        if lacks and not self.visibility.traits.shows_all_light:
+            raise ValueError(f"{lacks[0]}, or method = one of {methods}")
+        if self.shell is not None:
             check_bodies_within(self.bodies, self.shell)
         if self.bounces and not self.visibility.traits.finds_bounces:
             finders = ", ".join(map(repr, BOUNCE_METHODS))

@@ -73,9 +73,6 @@ def file(table: Table, key: str, folder: Path) -> Path:
     return check.file(key, folder / table[key])
 
 
-# ---------------------------------------------------------------------------------------------- writing
-
-
 def write(path: Path, tables: Mapping[str, object], *, comment: str = "") -> None:
     """Write a TOML file of tables, as :func:`text` has them, maybe below a line of comment."""
     with files.atomic_write(path) as unfinished:

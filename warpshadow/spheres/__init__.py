@@ -1,14 +1,13 @@
 """Spheres that cast the shadows of a mesh in its place.
 
-    cover       stage 1, the paper's: medial balls picked greedily, then descent on the volume outside the mesh and
-                the surface left bare                               [Lyu et al. 2021, section 3.2; Wang et al. 2006]
+    cover       stage 1: balls of the medial axis, picked greedily until they cover the mesh  [Wang et al. 2006]
     receivers   receivers on and around the mesh, in its cavities and on grounds, and their visibility, by rays
-    refine      stage 2: from balls picked greedily, gradient descent until the spheres' visibility matches the mesh's
+    refine      stage 2: gradient descent from there, until the spheres' visibility matches the mesh's
     enough      how many spheres a body needs, by short fits of a few counts
     measure     irradiance under a sky with a sun, the spheres' against the mesh's
     fit         the stages in order, the search for an error, the cache
 
-Stage 1 fits the volume, stage 2 the shadows; there, spheres may leave the mesh in part. An open mesh is a sheet, seen
+In stage 2, spheres may leave the mesh in part. An open mesh is a sheet, seen
 from both sides. Stage 2 uses the cones of warpshadow.stages.visibility.cones and the falloff of the directional method,
 so the fit matches the renderer at receivers on and inside spheres.
 """

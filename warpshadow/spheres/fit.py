@@ -24,7 +24,7 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import one_at_a_time
 from warpshadow.maths.adjacency import area_normals
 from warpshadow.maths.spatial_sort import compact_order
-from warpshadow.spheres.cover import descend_cover, greedy_cover
+from warpshadow.spheres.cover import greedy_cover
 from warpshadow.spheres.enough import AUTO, MAX_SPHERES, enough_spheres
 from warpshadow.spheres.measure import FitReport, measure
 from warpshadow.spheres.normalized_mesh import NormalizedMesh, normalize
@@ -32,10 +32,8 @@ from warpshadow.spheres.receivers import FitReceivers
 from warpshadow.spheres.refine import DescentState, Refinement
 from warpshadow.spheres.sphere_set import Spheres
 
-ALGORITHM_VERSION = 11
-"""Part of the key of cached fits: raise it whenever a fit would come out differently."""
+ALGORITHM_VERSION = 11  # part of the key of cached fits: raise it whenever a fit would come out differently
 
-COVER_STEPS = 200  # of stage 1 where it is all there is
 STEPS = 320  # of stage 2: 2000 are no better on a bunny
 
 RECEIVERS = 8192  # receivers that stage 2 draws from
@@ -62,6 +60,7 @@ class SphereFit(NamedTuple):
     report: FitReport
 
 
+@check.keywords(refine="steps=1, for spheres that cover the mesh and hardly more")
 @one_at_a_time
 def fit_spheres(
     mesh: Mesh,
@@ -69,7 +68,6 @@ def fit_spheres(
     *,
     error: float | None = None,
     seed: int = 0,
-    refine: bool = True,
     steps: int = STEPS,
     device: wp.DeviceLike = "cpu",
     cache: bool = True,
@@ -90,9 +88,7 @@ def fit_spheres(
         error: Instead of a count, the visibility error to reach (see FitReport), for example 0.05: the number
             of spheres is doubled from 16 until it is met, then bisected. If 1024 do not meet it, their fit
             comes with a warning.
-        refine: Refine the spheres until they cast the mesh's shadows (stage 2). False keeps the spheres of stage 1,
-            which cover the mesh, the paper's fit.
-        steps: Steps of gradient descent of the refinement.
+        steps: Steps of gradient descent, by which spheres that cover the mesh come to cast its shadows.
         seen_from: Direction, in the mesh's axes, to the side from which alone it is seen, as land is; its other faces
             need no spheres. Shape [3]; None for all sides.
         cache: Read and write the fit in a cache on disk, by the mesh's shape and the arguments above. The
@@ -117,14 +113,14 @@ def fit_spheres(
         check.positive("error", error)
     fit_device = check.device("device", device)
     seen_from = _unit_vector(seen_from)
-    key = count, error, seed, steps if refine else 0, seen_from, fit_device.alias, cache_folder()
+    key = count, error, seed, steps, seen_from, fit_device.alias, cache_folder()
     if cache and key in _FITS.get(mesh, ()):
         return _FITS[mesh][key]
-    fit_key, center, diagonal = _find_fit_key(mesh, seed, steps if refine else 0, fit_device, seen_from)
+    fit_key, center, diagonal = _find_fit_key(mesh, seed, steps, fit_device, seen_from)
     fit_count = partial(_cached_fit if cache else _fit, fit_key, progress)
     with unrecorded():
         balls, report = fit_count(count) if error is None else _search(fit_count, error)
-    if error is None and refine and warns:
+    if error is None and warns:
         _warn_of_holes(mesh, count, report, seen_from)
     balls = balls[compact_order(balls[:, :3])]  # neighbors are culled together
     spheres = Spheres(balls[:, :3] * diagonal + center, balls[:, 3] * diagonal)
@@ -259,7 +255,7 @@ def _fit(
     seen_from = None if fit_key.seen_from is None else np.array(fit_key.seen_from)
     mesh = NormalizedMesh(fit_key.positions, fit_key.faces, fit_key.device, seen_from)
     spheres = cached_arrays.get("spheres", np.zeros((0, 4)))
-    total, done_steps = (fit_key.steps or COVER_STEPS) if count else 0, int(cached_arrays.get("step_count", 0))
+    total, done_steps = fit_key.steps if count else 0, int(cached_arrays.get("step_count", 0))
     label = f"fitting {'as many spheres as it takes' if count == AUTO else f'{count} spheres'}"
 
     def store_part(part: str, **arrays: np.ndarray) -> None:
@@ -292,8 +288,7 @@ def _descend(
         store_part: Gets how far it is in words, and arrays from which a later call goes on.
     """
     rng = np.random.default_rng(fit_key.seed)
-    if fit_key.steps or isinstance(count, str):
-        receivers = FitReceivers(mesh, RECEIVERS, rng)
+    receivers = FitReceivers(mesh, RECEIVERS, rng)
     start: np.ndarray | DescentState
     if "spheres" in cached_arrays:
         start = DescentState(**{name: cached_arrays[name] for name in DescentState._fields})
@@ -305,15 +300,9 @@ def _descend(
 
             count = enough_spheres(mesh, receivers, fit_key.seed, [*cached_arrays.get("errors", ())], store_errors)
         start = greedy_cover(mesh, count, rng)
-        if not fit_key.steps:
-            yield from descend_cover(mesh, start, COVER_STEPS, rng)
-            return
     for descent_state in Refinement(mesh, receivers, rng).run(start, fit_key.steps):
         store_part(f"{descent_state.step_count} of {fit_key.steps} steps", **descent_state._asdict())
         yield descent_state.spheres
-
-
-# -------------------------------------------------------------------------------- cache
 
 
 def _cache_path(fit_key: _SphereFitKey, count: int | str) -> Path:

@@ -21,28 +21,6 @@ _MIN_SEEN_COSINE = 1e-3  # of faces that are seen from one side: walls of solids
 _RAYS = 32  # rays that tell whether a point sees next to nothing but the mesh: all but one meet it
 
 
-@wp.func
-def signed_distance(mesh: wp.uint64, is_sheet: bool, point: wp.vec3):
-    """Distance to the surface, negative where a solid winds around the point, and its gradient."""
-    sign = float(1.0)
-    face = int(0)
-    u = float(0.0)
-    v = float(0.0)
-    if is_sheet:
-        nearest = wp.mesh_query_point_no_sign(mesh, point, 1.0e6)
-        face = nearest.face
-        u = nearest.u
-        v = nearest.v
-    else:
-        query = wp.mesh_query_point_sign_winding_number(mesh, point, 1.0e6)
-        sign = query.sign
-        face = query.face
-        u = query.u
-        v = query.v
-    away = sign * (point - wp.mesh_eval_position(mesh, face, u, v))
-    return sign * wp.length(away), wp.normalize(away)
-
-
 @wp.kernel(enable_backward=False)
 def _signed_distances(
     # in
@@ -53,11 +31,26 @@ def _signed_distances(
     distances: wp.array[float],
     slopes: wp.array[wp.vec3],
 ):
-    """Each thread owns one point."""
+    """Each thread owns one point: its distance to the surface, negative where a solid winds around it, and gradient."""
     i = wp.tid()
-    distance, slope = signed_distance(mesh, is_sheet, points[i])
-    distances[i] = distance
-    slopes[i] = slope
+    sign = float(1.0)
+    face = int(0)
+    u = float(0.0)
+    v = float(0.0)
+    if is_sheet:
+        nearest = wp.mesh_query_point_no_sign(mesh, points[i], 1.0e6)
+        face = nearest.face
+        u = nearest.u
+        v = nearest.v
+    else:
+        query = wp.mesh_query_point_sign_winding_number(mesh, points[i], 1.0e6)
+        sign = query.sign
+        face = query.face
+        u = query.u
+        v = query.v
+    away = sign * (points[i] - wp.mesh_eval_position(mesh, face, u, v))
+    distances[i] = sign * wp.length(away)
+    slopes[i] = wp.normalize(away)
 
 
 @wp.kernel(enable_backward=False)

@@ -26,7 +26,6 @@ from warpshadow.device.lanes import (
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.directions import bundle_cones
-from warpshadow.spheres.adam import Adam
 from warpshadow.spheres.normalized_mesh import NormalizedMesh
 from warpshadow.spheres.receivers import FIT_BUNDLE, FitReceivers
 from warpshadow.stages.visibility.cones import make_cone
@@ -36,6 +35,8 @@ from warpshadow.stages.visibility.traversal import sphere_view_type
 TOUCH = 0.8
 """Largest distance of a sphere's center from the body, outside of it [radii]; one in the open stands for nothing."""
 
+RADIUS_RATE = 10.0  # step of the logarithm of a radius for a step of 1 of a center [1 / diagonals of the bounding box]
+
 RETURN_INTERVAL = 5  # steps after which spheres that are farther off are pulled back
 
 _SPHERE_COST = 10.0  # nanoseconds that it takes to see a sphere from a receiver
@@ -44,8 +45,6 @@ _PAIR_COST = 0.1  # nanoseconds that a sphere costs for a receiver and a directi
 _Bundle = lane_type(FIT_BUNDLE)
 _Sums = wp.types.vector(length=6, dtype=wp.float32)
 _FRAME_ROWS = 12  # numbers that say where a receiver is: its point, and the rows of its frame
-
-# ------------------------------------------------------------------------------------------------- cones
 
 
 @functools.cache
@@ -188,9 +187,6 @@ def _make_project_adjoint(lanes: int) -> wp.Kernel:
     return project_adjoint
 
 
-# ------------------------------------------------------------------------------------------------- transmittance
-
-
 @wp.kernel(enable_backward=False)
 def _transmit(
     first_row: int,
@@ -303,6 +299,22 @@ class _View(NamedTuple):
     axes: wp.array  # [receiver, sphere] vec3
     edges: wp.array  # [receiver, sphere] vec3
     reached: wp.array  # [receiver, sphere] int32: a bit for each bundle
+
+
+class Adam:
+    """Gradient descent that does not depend on the gradient's scale."""
+
+    def __init__(self, count: int):
+        self.mean, self.square, self.age = np.zeros((count, 4)), np.zeros((count, 4)), 0
+
+    def step(self, spheres: np.ndarray, gradient: np.ndarray, rate: float) -> None:
+        """Move spheres [sphere, 4] in place, against the gradient by centers and logarithms of radii."""
+        self.age += 1
+        self.mean += 0.1 * (gradient - self.mean)
+        self.square += 0.01 * (gradient**2 - self.square)
+        update = self.mean / (1 - 0.9**self.age) / (np.sqrt(self.square / (1 - 0.99**self.age)) + 1e-12)
+        spheres[:, :3] -= rate * update[:, :3]
+        spheres[:, 3] *= np.exp(-RADIUS_RATE * rate * update[:, 3])
 
 
 class DescentState(NamedTuple):

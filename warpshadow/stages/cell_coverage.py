@@ -29,8 +29,7 @@ share the disc. Shapes that meet at an edge share the cells there without a rema
 
 import warp as wp
 
-MIN_DISTANCE = 1.0e-12
-"""The least distance of an edge from ω."""
+MIN_DISTANCE = 1.0e-12  # the least distance of an edge from ω
 
 
 @wp.struct

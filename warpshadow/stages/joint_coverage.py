@@ -28,8 +28,7 @@ from warpshadow.device.parallel import split_row
 MIN_BOUNDS = wp.constant(1.0e-6)
 """Σ ν ν below which blockers count as independent: such a product is of the size of its rounding."""
 
-MOMENT_BOUND = wp.constant(wp.vec3(0.96935, -0.81588, 1.36307))
-"""ν(h) by powers of h (1 − h), from the first on."""
+MOMENT_BOUND = wp.constant(wp.vec3(0.96935, -0.81588, 1.36307))  # ν(h) by powers of h (1 − h), from the first on
 
 _PASS_COST = 1.0  # time of a cell [ns]
 

@@ -21,11 +21,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class Playback(Protocol):
-    """A call whose gradients can be asked for."""
-
-    def gradients(self, adjoints: Sequence[torch.Tensor]) -> tuple[torch.Tensor | None, ...]:
-        """The gradient to each argument, given the results' gradients; None where it requires none."""
+Playback: TypeAlias = Callable[[Sequence[torch.Tensor]], tuple[torch.Tensor | None, ...]]
+"""The gradient to each argument of a call, given the results' gradients; None where it requires none."""
 
 
 class Replayable(Protocol):
@@ -234,8 +231,8 @@ class _Playback:
         for result in self._results:
             drop_gradient(result)
 
-    def gradients(self, adjoints: Sequence[torch.Tensor]) -> tuple[torch.Tensor | None, ...]:
-        """The gradient to each argument, given the results' gradients; None where it requires none."""
+    def __call__(self, adjoints: Sequence[torch.Tensor]) -> tuple[torch.Tensor | None, ...]:
+        """The gradient to each argument: :data:`Playback`."""
         with one_call, current_stream(adjoints[0].device), unrecorded():
             if self._is_played:  # before, gradients are zero
                 self._tape.zero()
@@ -285,18 +282,18 @@ class _WarpFunction(torch.autograd.Function):
         tensors = ctx.saved_tensors
         if torch.is_grad_enabled():  # create_graph=True
             return None, None, *_WarpAdjoint.apply(ctx.call, ctx.playback, len(tensors), *tensors, *adjoints)
-        return None, None, *ctx.playback.gradients(adjoints)
+        return None, None, *ctx.playback(adjoints)
 
 
 class _WarpAdjoint(torch.autograd.Function):
     """Gradients that may be differentiated again: d⟨v, Jᵀa⟩ = d⟨a, J v⟩, and J v of an affine function is one call."""
 
     @staticmethod
-    def forward(ctx, call: _Call, playback: _Playback, count: int, *arguments: torch.Tensor):
+    def forward(ctx, call: _Call, playback: Playback, count: int, *arguments: torch.Tensor):
         ctx.call, ctx.count = call, count
         ctx.save_for_backward(*arguments)
         ctx.set_materialize_grads(False)
-        return playback.gradients(arguments[count:])
+        return playback(arguments[count:])
 
     @staticmethod
     def backward(ctx, *directions: torch.Tensor | None):

@@ -316,7 +316,10 @@ class _Batch:
             )
         for scene, geometry_of_scene in enumerate(geometry):
             count = len(self.rows.get(scene, ()))
-            got = 0 if geometry_of_scene is None else _instances(as_geometry(f"geometry[{scene}]", geometry_of_scene))
+            got = 0
+            if geometry_of_scene is not None:
+                positions = as_geometry(f"geometry[{scene}]", geometry_of_scene).positions
+                got = len(positions) if positions.ndim > 2 else 1
             if got != count and not (got == 1 and count):
                 raise ValueError(
                     f"geometry[{scene}]: got {got} instances, expected {count}, as many images as which has of the "
@@ -334,11 +337,6 @@ class _Batch:
         rows = itertools.chain.from_iterable(self.rows[scene] for scene in images)
         ordered_images = dict(zip(rows, itertools.chain.from_iterable(images.values()), strict=True))
         return torch.stack([ordered_images[row] for row in range(self.count)])
-
-
-def _instances(geometry: Geometry[torch.Tensor]) -> int:
-    """Length of the batch of a geometry, 1 where it has none."""
-    return len(geometry.positions) if geometry.positions.ndim > 2 else 1
 
 
 def _without_padding(tensor: Any, ndim: int, count: int) -> Any:

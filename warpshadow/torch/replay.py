@@ -25,7 +25,7 @@ from warpshadow.device import cuda_graph
 from warpshadow.device.constants import collected
 from warpshadow.device.memory import require_gradient
 from warpshadow.device.tape import recorded, unrecorded
-from warpshadow.torch.autograd import TensorCall, array_of, as_array, current_stream, is_capturing
+from warpshadow.torch.autograd import Playback, TensorCall, array_of, as_array, current_stream, is_capturing
 
 _PLAIN_CALLS = 2  # of a kind before it is captured: the first compiles kernels and fills caches, as may the second
 _MAX_FAILURES = 2  # after which calls of a kind stay plain
@@ -33,15 +33,11 @@ _MAX_KINDS = 8  # captured at a time: each holds the memory of its call
 
 
 class Replays:
-    """The captured calls of a renderer.
-
-    Attributes:
-        reason: Why the last call was plain; empty if it was replayed.
-    """
+    """The captured calls of a renderer."""
 
     def __init__(self, *, is_on: bool):
         self.is_on = is_on
-        self.reason = "nothing was called yet"
+        self.reason = "nothing was called yet"  # why the last call was plain; empty if it was replayed
         self._kinds: dict[Hashable, _Kind] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -176,12 +172,12 @@ class Capture:
         """Whether each result depends on tensors that require a gradient."""
         return [result.requires_grad for result in self._results]
 
-    def replay(self, tensors: Sequence[torch.Tensor]) -> tuple[tuple[torch.Tensor, ...], ReplayedCall]:
+    def replay(self, tensors: Sequence[torch.Tensor]) -> tuple[tuple[torch.Tensor, ...], Playback]:
         """Replay it forward: the results, and the call for its gradients."""
         self._launch_forward(tensors)
         with current_stream(self._device):
             results = tuple(wp.to_torch(result, requires_grad=False).clone() for result in self._results)
-        return results, ReplayedCall(self, tensors, self._state)
+        return results, functools.partial(self._gradients, [tensor.detach() for tensor in tensors], self._state)
 
     def _launch_forward(self, tensors: Sequence[torch.Tensor]) -> None:
         for static, tensor in zip(self._inputs, tensors, strict=True):
@@ -190,7 +186,7 @@ class Capture:
         with current_stream(self._device):
             wp.capture_launch(self._forward)
 
-    def gradients(
+    def _gradients(
         self, tensors: Sequence[torch.Tensor], state: int, adjoints: Sequence[torch.Tensor]
     ) -> tuple[torch.Tensor | None, ...]:
         """The gradient to each tensor; the call is replayed once more if another has been since, or its gradients."""
@@ -205,14 +201,3 @@ class Capture:
                 wp.to_torch(argument.grad, requires_grad=False).clone() if argument.requires_grad else None
                 for argument in self._arguments
             )
-
-
-class ReplayedCall:
-    """A replayed call, to be played back as often as asked."""
-
-    def __init__(self, capture: Capture, tensors: Sequence[torch.Tensor], state: int):
-        self._capture, self._tensors, self._state = capture, [tensor.detach() for tensor in tensors], state
-
-    def gradients(self, adjoints: Sequence[torch.Tensor]) -> tuple[torch.Tensor | None, ...]:
-        """The gradient to each argument, given the results' gradients; None where it requires none."""
-        return self._capture.gradients(self._tensors, self._state, adjoints)

@@ -52,10 +52,8 @@ class Trial(NamedTuple):
 
     scene: Scene
     """The scene with it."""
-    error: float
-    """‖B − B_mesh‖ / ‖B_mesh‖ over points that the camera sees, B the shading."""
-    milliseconds: float
-    """Time of an image; Inf where it is not measured, since the error is too large anyway."""
+    error: float  # ‖B − B_mesh‖ / ‖B_mesh‖ over points that the camera sees, B the shading
+    milliseconds: float  # time of an image; Inf where it is not measured, since the error is too large anyway
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,8 +345,6 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
-# ---------------------------------------------------------------------------------------------- "auto"
-
 _resolved: weakref.WeakKeyDictionary[Scene, Scene] = weakref.WeakKeyDictionary()
 
 
@@ -418,9 +414,6 @@ def _settings_by_work(scene: Scene, sample: PointSample) -> Iterator[Scene]:
 
 def _all_directions(scene: Scene) -> Iterator[Scene]:
     return (replace(scene, visibility=visibility) for visibility in _variants(scene, "directional"))
-
-
-# ---------------------------------------------------------------------------------------------- settings
 
 
 def _trial_scenes(scene: Scene, fine: Sequence[str], fits: bool, device: wp.DeviceLike) -> Iterator[Scene]:

@@ -37,10 +37,6 @@ class ViewerApp:
 
     Args:
         path: The scene's file, which is saved with the changes in it; None where it has none.
-    Attributes:
-        painter: Paints pictures.
-        loop: Renders for pages.
-        url: Where the page is.
     """
 
     def __init__(
@@ -55,14 +51,14 @@ class ViewerApp:
     ):
         check_address(host, port)
         scene = resolved(scene, device=device, progress=progress)
-        self.painter = Painter(scene, device=device, progress=progress)
+        self.painter = Painter(scene, device=device, progress=progress)  # paints pictures
         self._is_prepared = is_cached_on_disk(self.painter, device=device)
         self._preparation: Preparation | None = None
         self._pages: dict[int, _ViserPage] = {}
         stops = self.painter.natural_stops(self._look_for_now(ViewerState.of(scene)))
-        self.loop = Loop(self._paint, ViewerState.of(scene, stops))
+        self.loop = Loop(self._paint, ViewerState.of(scene, stops))  # renders for pages
         self._server = Server(host, port)
-        self.url = self._server.url
+        self.url = self._server.url  # where the page is
         self._start_where_the_scene_looks()
         self._panel = Panel(self._server, self.loop, self.painter, path)
         self._server.on_client_connect(self._let_in)

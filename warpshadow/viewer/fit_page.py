@@ -19,16 +19,12 @@ _WIDTH = 760  # of the pictures' panel [CSS pixels]
 
 
 class FitPage:
-    """A page that shows a fit, until it is closed; all browsers share it.
-
-    Attributes:
-        url: Where it is.
-    """
+    """A page that shows a fit, until it is closed; all browsers share it."""
 
     def __init__(self, host: str, port: int):
         check_address(host, port)
         self._server = Server(host, port)
-        self.url = self._server.url
+        self.url = self._server.url  # where it is
         self._wishes = threading.Condition()  # guards the attributes below
         self._pauses = self._stops = False
         gui = self._server.gui
@@ -40,8 +36,6 @@ class FitPage:
         self._pictures: viser.GuiImageHandle | None = None
         self._pause.on_click(self._pause_or_go_on)
         self._stop.on_click(self._ask_to_stop)
-
-    # ------------------------------------------------------------------------------------------ requests
 
     @property
     def is_watched(self) -> bool:
@@ -73,8 +67,6 @@ class FitPage:
         with self._wishes:
             self._stops = True
             self._wishes.notify_all()
-
-    # ------------------------------------------------------------------------------------------ display
 
     def show(self, note: str, losses: Sequence[Sequence[Sequence[float]]], stage: int, candidates: int) -> None:
         """Show how far a fit is, by the losses of the iterations of each descent of each stage."""

@@ -42,16 +42,11 @@ class Paint(Protocol):
 
 
 class Loop:
-    """Paints for any number of pages.
-
-    Attributes:
-        viewer_state: The viewer state.
-        depth: Whether pages are sent how far away everything is.
-    """
+    """Paints for any number of pages."""
 
     def __init__(self, paint: Paint, viewer_state: ViewerState, *, rest: float = REST):
-        self.viewer_state = viewer_state
-        self.depth = False
+        self.viewer_state = viewer_state  # the viewer state
+        self.depth = False  # whether pages are sent how far away everything is
         self._paint, self._rest = paint, rest
         self._painting = threading.Lock()
         self._changed = threading.Condition()  # guards the attributes below
@@ -127,8 +122,6 @@ class Loop:
             if client.request_time is None:  # a delay counts from the oldest request that a picture answers
                 client.request_time = self._last_request
         self._changed.notify_all()
-
-    # ------------------------------------------------------------------------------------------ the thread of a page
 
     def _serve(self, client: _Client) -> None:
         frame_rate, last = FrameRate(), None

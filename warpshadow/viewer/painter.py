@@ -91,7 +91,8 @@ class Painter:
         depths = None
         if depth:
             depths = self.page_scale * distances(renderer, view)
-            depths = np.minimum(depths, _FAR)[:: (step := _step(depths.size)), ::step].astype(np.float32)
+            step = max(1, int(np.ceil(np.sqrt(depths.size / _DEPTH_PIXELS))))
+            depths = np.minimum(depths, _FAR)[::step, ::step].astype(np.float32)
         settings = renderer.scene.visibility
         if settings.method == "directional":
             cells = f"{settings.directions} directions"
@@ -284,11 +285,6 @@ def distances(renderer: Renderer, view: View) -> np.ndarray:
     depths = view.clip_positions.value(view.call).numpy()[0, :, 3]  # w of clip space is the distance
     corners = depths[renderer.merged_scene.faces.numpy()[np.maximum(faces, 0)]]
     return np.where(faces < 0, np.inf, (corners * weights).sum(axis=-1))
-
-
-def _step(count: int) -> int:
-    """Every so many pixels a depth is sent."""
-    return max(1, int(np.ceil(np.sqrt(count / _DEPTH_PIXELS))))
 
 
 def own_page(scene: Scene, scale: float) -> PageCamera:

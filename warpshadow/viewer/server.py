@@ -32,8 +32,6 @@ class Server(viser.ViserServer):
     Args:
         host: Address to serve at; others than this machine's own let everybody in who can reach it.
         port: Port, or the next that is free.
-    Attributes:
-        url: Where its page is.
     """
 
     def __init__(self, host: str, port: int):
@@ -41,7 +39,7 @@ class Server(viser.ViserServer):
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table
             super().__init__(host=host, port=port, label="warpshadow", verbose=False)
         name = {"0.0.0.0": "localhost", "::": "localhost"}.get(host, host)
-        self.url = f"http://{f'[{name}]' if ':' in name else name}:{self.get_port()}"
+        self.url = f"http://{f'[{name}]' if ':' in name else name}:{self.get_port()}"  # where its page is
         logging.getLogger("websockets.server").addFilter(_in_one_line)  # the same filter is added once
         is_local = host in OWN_NAMES
         self._websock_server.on_client_connect(_guard(self, is_local))

@@ -15,8 +15,7 @@ from warpshadow.inverse.world import FittedScene, Setting, World
 from warpshadow.maths.directions import fibonacci
 from warpshadow.scene.scene import Scene
 
-STARTS = 8
-"""Directions above the middle of a scene from which the search for a lamp starts."""
+STARTS = 8  # directions above the middle of a scene from which the search for a lamp starts
 
 _REACH = 4.0  # turn [radians], and logarithm of the distance, for a value of 1: a lamp moves farther than a pose
 
@@ -45,17 +44,13 @@ class Lamp(FreeOfBody):
     def start(self, setting: Setting) -> Values:
         return {"turn": setting.tensor(np.zeros(2)), "log_distance": setting.tensor(0.0)}
 
-    def _middle(self, setting: Setting) -> np.ndarray:
-        """Middle of the bodies that do not emit, without flat bodies if there are others."""
-        others = [body for body in setting.scene.bodies if not body.is_emitter]
-        solid = [body for body in others if not body.mesh.is_flat]
-        return np.mean([np.mean(body.world_mesh().bounds, axis=0) for body in solid or others], axis=0)
-
     def _start(self, setting: Setting) -> tuple[np.ndarray, np.ndarray, float]:
         """Middle of the others, and from there the direction and the distance of the lamp in the scene."""
 
         def find() -> tuple[np.ndarray, np.ndarray, float]:
-            middle = self._middle(setting)
+            others = [body for body in setting.scene.bodies if not body.is_emitter]
+            solid = [body for body in others if not body.mesh.is_flat]  # which count alone, if there are any
+            middle = np.mean([np.mean(body.world_mesh().bounds, axis=0) for body in solid or others], axis=0)
             offset = setting.scene.bodies[self.number].to_world(setting.middle(self.number)) - middle
             distance = float(np.linalg.norm(offset))
             return middle, (offset / distance if distance > 0 else np.array(constraints.UP)), distance

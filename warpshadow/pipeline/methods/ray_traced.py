@@ -30,8 +30,7 @@ if TYPE_CHECKING:  # it is imported where bodies emit
     from warpshadow.stages.emitters.samples import PlacedSamples
 
 Meshes = list[wp.Mesh | None]  # mesh that blocks light of each instance, the last of the rest; None for no blocker
-_RAYS_OF_CELL = 4
-"""Least number of rays to a cell of free light, on average."""
+_RAYS_OF_CELL = 4  # least number of rays to a cell of free light, on average
 
 _EVEN_RAYS = 128  # directions in which receivers that shine look for how much of the hemisphere is open
 

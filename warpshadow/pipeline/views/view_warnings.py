@@ -7,9 +7,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.receivers.choice_of_receivers import face_sizes, warn_of_coarse_faces
 from warpshadow.pipeline.views.view import View
 from warpshadow.scene.body import Body
-from warpshadow.scene.creases import lined_surfaces, rounded_edges
-from warpshadow.scene.placement import enclosures, misplacements
-from warpshadow.scene.shell_light import blurred_shell
+from warpshadow.scene.remarks import blurred_shell, enclosures, lined_surfaces, misplacements, rounded_edges
 
 
 def warn_of_view(view: View, cameras: Sequence[Camera] | None) -> bool:

@@ -15,8 +15,7 @@ import warp as wp
 
 from warpshadow.maths.adjacency import area_normals
 
-_BRIGHT = 8.0
-"""Radiosity from which a patch is bright, in means of the scene: an evenly lit scene has none."""
+_BRIGHT = 8.0  # radiosity from which a patch is bright, in means of the scene: an evenly lit scene has none
 
 
 @wp.struct

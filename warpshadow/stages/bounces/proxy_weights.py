@@ -22,8 +22,7 @@ from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 
 _CORE = 0.25  # radii within which a proxy's weight hardly grows any more
 
-_NEAREST2 = 1.0e-12
-"""The least d² + (r/4)², in squares of s: so √w is at most 1e12."""
+_NEAREST2 = 1.0e-12  # the least d² + (r/4)², in squares of s: so √w is at most 1e12
 
 _HIDDEN = 1.0e-8  # ε
 _TINY = 1.0e-18  # distance that has a derivative

@@ -23,10 +23,8 @@ class ConvexBody(NamedTuple):
     """A body that consists of convex parts, among all bodies."""
 
     parts: Sequence[ConvexPart]
-    first_vertex: int
-    """Offset of its vertices among the vertices of all bodies."""
-    blocks: bool = True
-    """Whether it casts shadows."""
+    first_vertex: int  # offset of its vertices among the vertices of all bodies
+    blocks: bool = True  # whether it casts shadows
 
 
 UNSEEN = wp.constant(1.0e30)

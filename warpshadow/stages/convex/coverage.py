@@ -35,8 +35,7 @@ from warpshadow.stages.convex.silhouette import ADJOINT_LANES, EDGE_LANES, SUM_L
 from warpshadow.stages.visibility.culling import make_cells
 from warpshadow.stages.visibility.directional import SOFTNESS
 
-_PART_COST = 200.0
-"""Mean time of a part of a receiver [ns]."""
+_PART_COST = 200.0  # mean time of a part of a receiver [ns]
 
 
 class _PartFunctions(NamedTuple):

@@ -21,14 +21,11 @@ EDGE_LANES = 5
 alone, −1 where it sees the one to its left alone, else 0; and a number added to m·ω: 2 where the sign is 0, so that no
 cell meets the edge, else 0."""
 
-ADJOINT_LANES = 6
-"""Lanes of an edge's gradients: of its normal; or of its two ends."""
+ADJOINT_LANES = 6  # lanes of an edge's gradients: of its normal; or of its two ends
 
-SUM_LANES = 7
-"""Lanes of sums over chords: area, product of complex numbers, its turns, and moment."""
+SUM_LANES = 7  # lanes of sums over chords: area, product of complex numbers, its turns, and moment
 
-_MIN_EDGE_SINE = 1.0e-6
-"""Sine of the least angle under which a receiver sees an edge."""
+_MIN_EDGE_SINE = 1.0e-6  # sine of the least angle under which a receiver sees an edge
 
 _ENDS = """
     const float ax = a.c[0] - points.x.c[lane], bx = b.c[0] - points.x.c[lane];

@@ -36,8 +36,7 @@ from warpshadow.stages.sparse import SparseMatrix, multiply
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-SAMPLE_BUNDLE = 8
-"""Samples next to each other that blockers are culled for together; an emitter has a multiple of them."""
+SAMPLE_BUNDLE = 8  # samples next to each other that blockers are culled for together; an emitter has a multiple of them
 
 SAMPLES = 64  # samples of an emitter
 

@@ -36,8 +36,7 @@ from warpshadow.stages.planes.sides import (
     visible_cell,
 )
 
-SAMPLES = 8
-"""Directions of a cell."""
+SAMPLES = 8  # directions of a cell
 
 _PER_RAMP = wp.constant(20.0)  # one over the coverage from which on a cell counts as covered in part
 _CELL_COST = 4.0  # mean time of a cell of a receiver [ns]: few are looked at

@@ -191,8 +191,7 @@ class Corners(NamedTuple):
 
     receivers: np.ndarray
     """Four for each receiver, −1 for none, int of shape [receiver, 4]; these four have none themselves."""
-    weights: np.ndarray
-    """Bilinear weights of the corners, [receiver, 4]."""
+    weights: np.ndarray  # bilinear weights of the corners, [receiver, 4]
 
     @classmethod
     def none(cls, count: int) -> "Corners":

@@ -21,8 +21,7 @@ from warpshadow.device.memory import empty
 
 MIN_DISTANCE = 1.0e-6  # between a receiver and the shell, in radii, nearer than which light no longer grows
 
-FAR = np.zeros(4, np.float32)
-"""The shell of light from infinitely far away."""
+FAR = np.zeros(4, np.float32)  # the shell of light from infinitely far away
 
 wp.set_module_options({"max_unroll": 1})
 

@@ -21,8 +21,7 @@ from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK, MIN_WIDTH, brightest_chunk, cell_radius
 from warpshadow.stages.visibility.directional import SOFTNESS
 
-RADII_PER_HALF_ANGLE = 2.4
-"""Radius of the cell whose soft edge is like a spot's penumbra, in half-angles of the spot."""
+RADII_PER_HALF_ANGLE = 2.4  # radius of the cell whose soft edge is like a spot's penumbra, in half-angles of the spot
 
 _MIN_SHARE = 0.1  # share of all light that sharp cells have at least: less is not worth their time
 

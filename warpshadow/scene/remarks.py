@@ -1,4 +1,4 @@
-"""Where bodies stand: whether one floats above a ground, lies below it, is broader, or is around a camera."""
+"""Remarks on a scene: where bodies stand, normals that show as lines or dark edges, and light that is blurred."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -6,12 +6,14 @@ from typing import NamedTuple
 import numpy as np
 
 from warpshadow.assets.camera import Camera
-from warpshadow.assets.mesh import Mesh
+from warpshadow.assets.light import EnvironmentMap
+from warpshadow.assets.topology import CREASE
 from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene
 
+_HALF = 0.5  # share of all light that is looked for in the brightest part of a shell
 _GROUND_COSINE = 0.99  # cosine of the angle to +y up to which a flat body is a ground
 _CEILING_RATIO = 1.01  # ratio of breadths up to which a body is as broad as its ground, such as a ceiling
 
@@ -101,7 +103,10 @@ def enclosures(scene: Scene, cameras: Iterable[Camera]) -> list[str]:
         for number, body in enumerate(scene.bodies):
             low, high = body.mesh.bounds
             eye = body.from_world(camera.eye)
-            if (low < eye).all() and (eye < high).all() and _winding_number(body.mesh, eye) > 0.5:
+            if not ((low < eye).all() and (eye < high).all()):
+                continue
+            corners = body.mesh.positions[body.mesh.faces].astype(np.float64) - eye
+            if solid_angles(corners).sum() > 2 * np.pi:  # a closed one that faces outwards has 4π around points inside
                 place = ", ".join(f"{coordinate:.3g}" for coordinate in camera.eye)
                 return [
                     f"camera: its eye ({place}) is inside body {number} ({body.name!r}), which is "
@@ -110,15 +115,51 @@ def enclosures(scene: Scene, cameras: Iterable[Camera]) -> list[str]:
     return []
 
 
-def _winding_number(mesh: Mesh, point: np.ndarray) -> float:
-    """How often a mesh goes around a point: 1 inside a closed one that faces outwards."""
-    corners = mesh.positions[mesh.faces].astype(np.float64) - point
-    return float(solid_angles(corners).sum() / (4 * np.pi))
-
-
 def _is_ground(body: Body, box: _Box) -> bool:
     size, mesh = box.high - box.low, body.mesh
     if body.is_emitter or size[1] > 0.2 * size.max():  # at once: most bodies are not flat
         return False
     normal = plane_normal(mesh.positions[mesh.faces].astype(np.float64))
     return normal is not None and bool((body.rotation_matrix() @ normal)[1] > _GROUND_COSINE)
+
+
+def rounded_edges(scene: Scene) -> list[str]:
+    """Say which bodies have many sharp edges whose faces share vertices, and so normals."""
+    return [
+        f"body {number} ({body.name!r}) has sharp edges whose faces share vertices, and so normals, which make them "
+        f"dark or bright; Body(…).creased(), in scene files and recipes creased = {CREASE:g}, parts them"
+        for number, body in enumerate(scene.bodies)
+        if body.mesh.rounds_edges
+    ]
+
+
+def lined_surfaces(scene: Scene) -> list[str]:
+    """Say over which bodies lines run, where vertices at one place have normals of their own."""
+    return [
+        f"body {number} ({body.name!r}): {body.mesh.split_count:,} vertices coincide with others, and their "
+        "normals differ, which shows as lines over smooth surfaces; mesh.welded() joins them"
+        for number, body in enumerate(scene.bodies)
+        if body.mesh.split_count
+    ]
+
+
+def blurred_shell(scene: Scene) -> list[str]:
+    """Say that half of the light comes from less of the shell than a cell, by which its shadows are blurred.
+
+    A studio with a small soft box, at a radius of 3, was 16% off, and with 512 cells in place of 128 half of that.
+    """
+    light = scene.known_light
+    if scene.shell is None or not scene.visibility.traits.has_cells or not isinstance(light, EnvironmentMap):
+        return []
+    powers = (light.radiance.mean(axis=2, dtype=np.float64) * light.solid_angles()[:, None]).ravel()
+    solid_angles = np.repeat(light.solid_angles(), light.radiance.shape[1])
+    brightest = (-powers / solid_angles).argsort()
+    half_count = np.searchsorted(powers[brightest].cumsum(), _HALF * powers.sum())
+    share = solid_angles[brightest[: half_count + 1]].sum() / (4 * np.pi)
+    if share * scene.direction_count >= 1:
+        return []
+    return [
+        f"light: half of it comes from {share:.2%} of its shell, less than one of the {scene.direction_count} cells "
+        "through which bodies block it, so its shadows are blurred; stills have them sharp, as lamps do, "
+        "Body(…, emission=…), and Visibility(directions=…) blurs them less"
+    ]
