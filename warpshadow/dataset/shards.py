@@ -147,7 +147,6 @@ def _new_archive(path: Path) -> Iterator[tarfile.TarFile]:
 
 
 def _add(archive: tarfile.TarFile, number: int, sample: dict[str, bytes]) -> None:
-    """Write the files of a sample."""
     for ending, content in sorted(sample.items()):
         member = tarfile.TarInfo(f"{number:09d}.{ending}")  # of no user, and of 1970: always the same bits
         member.size = len(content)

@@ -325,7 +325,6 @@ class _Descent:
 
 
 def _descends(free: Free, stage: Stage) -> bool:
-    """Whether a stage descends to a parameter."""
     if stage.compares == "outlines":
         return free.shows_in_outlines
     return not (stage.solves_light and free.is_light)

@@ -40,13 +40,12 @@ class ImageInputs(Generic[Array, Placed]):
             bodies, None for the scene's own, or a mapping for some, by their numbers or names: ``{"bunny": color}``.
             Values above 1, which a Body refuses, are taken as they are: free ones may pass 1 on their way.
         textures: Reflectance of bodies as images, [height, width, 3], which needs uvs; a list or a mapping likewise.
-        emission: Radiance, 0 or more, that bodies emit which have emission in the scene, linear RGB, as albedo; or an
-            image, [height, width, 3], of bodies with uvs: one that is as wide as there are vertices, or 1 wide, needs
-            the batch.
+        emission: Radiance, 0 or more, of bodies that have emission in the scene: colors as of albedo, or images as of
+            textures.
         roughness: Of bodies that have roughness in the scene, one number, [] or [1], one for each vertex, [vertex], or
-            an image, [height, width], of bodies with uvs: one that is as wide as there are vertices, or 1 wide, needs
-            the batch. A list or a mapping, as albedo. Numbers beyond [0, 1] are refused: clamp them after each step of
-            an optimizer, or free the input of a sigmoid.
+            an image, [height, width]; a list or a mapping likewise. Numbers beyond [0, 1] are refused: clamp them after
+            each step of an optimizer, or free the input of a sigmoid. An image that is as wide as there are vertices,
+            or 1 wide, needs the batch; so does one of emission.
         metallic, specular: Likewise, of the same bodies.
         shell: Where the scene's light has a radius: center and radius of the sphere that sends the light [scene units],
             [4], in place of the scene's or a map's own; all bodies are inside.

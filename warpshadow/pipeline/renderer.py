@@ -275,9 +275,7 @@ class SceneRenderer:
         """Find the reflectance that samples see.
 
         Args:
-            albedo: Of bodies, vec3 of shape [batch, 1] or [batch, vertex]: a list for all, None for the scene's own, or
-                a mapping for some, by their numbers or names.
-            textures: Likewise, vec3 of shape [batch, height, width], which needs uvs.
+            albedo, textures: As of an image (:class:`.ImageInputs`).
             view: By default the scene's own.
         Returns:
             vec3 of shape [batch, height, width]. Not to be written to.

@@ -60,7 +60,7 @@ class Body:
         rotation: Axis-angle vector [degrees], shape [3]: (0, 90, 0) is a quarter turn about +y, through the origin of
             the mesh's own space, wherever its vertices are; :meth:`on_ground` then stands the body where it is to
             stand, and :meth:`Renderer.placed` can turn it about its middle. A matrix, shape [3, 3], becomes such a
-            vector. (In :mod:`warpshadow.torch` and :mod:`warpshadow.stages` axis-angle vectors are in radians.)
+            vector.
         translation: Offset [scene units], shape [3].
         scale: Factor, positive.
         receivers: Where light is evaluated: at every "vertex", or at every "pixel" that shows the body, which a mesh

@@ -125,14 +125,12 @@ def _standing_share(points: np.ndarray, middle: np.ndarray, axis: int) -> float:
 
 
 def _upside_down(points: np.ndarray, axis: int) -> np.ndarray:
-    """Points upside down."""
     result = points.copy()
     result[:, axis] = points[:, axis].min() + points[:, axis].max() - points[:, axis]
     return result
 
 
 def _mean_distance(points: np.ndarray, others: np.ndarray) -> float:
-    """Mean distance of points to the nearest of others."""
     from scipy.spatial import cKDTree
 
     return float(cKDTree(others).query(points)[0].mean())

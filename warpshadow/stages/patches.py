@@ -381,7 +381,6 @@ def _cluster(features: np.ndarray, areas: np.ndarray, density: np.ndarray, count
 
 
 def _nearest_center(centers: np.ndarray, features: np.ndarray) -> np.ndarray:
-    """The nearest center of each feature."""
     from scipy.spatial import cKDTree
 
     return cKDTree(centers).query(features)[1]

@@ -319,10 +319,9 @@ class TorchRenderer(torch.nn.Module):
         """Place the bodies in the world: x → s R (x − pivot) + t.
 
         Args:
-            rotations: Of each body, [body, 3, 3] or [batch, body, 3, 3], from :func:`rotation_matrices`, which takes
-                radians where a ``Body.rotation`` is in degrees. Entries of RᵀR may differ from the identity by 0.05,
-                which a step of 0.01 in each of the nine numbers leaves them; to go on from there,
-                ``rotation_matrices(rotations.flatten(-2))`` are the nearest rotations.
+            rotations: Of each body, [body, 3, 3] or [batch, body, 3, 3], from :func:`rotation_matrices`. Entries of RᵀR
+                may differ from the identity by 0.05, which a step of 0.01 in each of the nine numbers leaves them; to
+                go on from there, ``rotation_matrices(rotations.flatten(-2))`` are the nearest rotations.
             translations: Of each body [scene units], [body, 3] or [batch, body, 3].
             scales: Of each body, [body] or [batch, body]; by default the scene's.
             rest: The bodies in their own spaces, from :meth:`deformed`; by default as their meshes are.
@@ -370,8 +369,7 @@ class TorchRenderer(torch.nn.Module):
         Args:
             pivot: As for :meth:`placed`, without a batch: translations are then where the pivots are.
         Returns:
-            Rotations [body, 3, 3], which multiply column vectors, translations [body, 3] and scales [body]. A
-            ``Body.rotation`` is in degrees; :func:`rotation_matrices` takes radians.
+            Rotations [body, 3, 3], which multiply column vectors, translations [body, 3] and scales [body].
         """
         points = pivot.detach().cpu().numpy() if isinstance(pivot, torch.Tensor) else pivot
         poses = self.warp.scene_poses(pivot=points)

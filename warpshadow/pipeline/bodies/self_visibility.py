@@ -249,7 +249,6 @@ class SelfVisibility:
         return self._of_mesh(body, "ray probes", find)
 
     def _tree(self, body: int) -> FaceTree:
-        """The hierarchy of a body's faces."""
         faces = self._merged_scene.scene.bodies[body].mesh.surface.faces
         build = functools.partial(build_face_tree, self.probes(body).positions, faces, self._merged_scene.device)
         return self._of_mesh(body, "tree", build)

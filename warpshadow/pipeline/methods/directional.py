@@ -157,7 +157,6 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     def _past_spheres(
         self, group: Group, horizon_normals: wp.array | None, projected_light: ProjectedCells
     ) -> wp.array:
-        """Transmittance past spheres."""
         arguments, scales = (group.points, horizon_normals, group.centers, group.radii), self._scales
         block = functools.partial(directional.transmittance, *arguments, skip=group.skip, clusters=group.clusters)
         transmittance = block(projected_light.blocking_directions, **scales(1.0))

@@ -307,7 +307,6 @@ def find_groups(
 def _groups_that_move(
     receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any], nearest_spheres: np.ndarray | None
 ) -> Iterator[Group]:
-    """Groups of receivers that may move."""
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
     spheres, none = blockers.spheres_of(sphere_bodies), blockers.spheres_of([])
     clusters, nearest_blockers = None, _nearest_blockers(nearest_spheres, blockers)

@@ -103,7 +103,6 @@ def _add_to_open_part(hits: wp.array(dtype=PlaneHit), i: int, open_share: float,
 def _add_to_hit(
     adj_hits: wp.array(dtype=PlaneHit), i: int, coverage: float, centroid: wp.vec3, inverse_distance: wp.vec3
 ):
-    """Add to the adjoint of a hit."""
     adj_hits[i].coverage = adj_hits[i].coverage + coverage
     adj_hits[i].centroid = adj_hits[i].centroid + centroid
     adj_hits[i].inverse_distance = adj_hits[i].inverse_distance + inverse_distance

@@ -122,7 +122,6 @@ def _share_within(border: Border, beam: Beam):
 
 @wp.func
 def _hidden_share(parts: PlacedPartArrays, part: int, beam: Beam):
-    """The share a of a part."""
     border = _nearest_border(parts, part, beam)
     share = float(0.0)
     if border.is_any:

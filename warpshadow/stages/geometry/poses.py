@@ -161,7 +161,6 @@ class Poses:
         return rotated
 
     def _shape(self, rest: wp.array, bodies: wp.array) -> tuple[int, int]:
-        """Shape of the moving arrays."""
         check.shape("rest", rest.shape, ("batch", bodies.shape[0]))
         arrays = {"rest": rest, "rotations": self.rotations, "translations": self.translations, "scales": self.scales}
         finite_arrays(arrays, nonnegative=["scales"])

@@ -164,7 +164,6 @@ def _front_by_sphere(height: float, center_height: float, radius: float):
 
 @wp.func
 def _front_by_height(height: float, margin: float, side_of_body: float, facing_cosine: float):
-    """Front of a receiver."""
     front = wp.where(height > 0.0, 1.0, 0.0)
     if wp.abs(height) < 2.0 * margin:
         front = wp.smoothstep(

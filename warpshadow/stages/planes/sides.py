@@ -110,7 +110,6 @@ def load_side(planes: PlaneArrays, receiver: PlaneReceiver, index: int):
 
 @wp.func
 def _side_normal(side: PlaneSide):
-    """Normal of a plane away from a side."""
     return wp.where(side.is_back, 1.0, -1.0) * side.local_receiver.normal
 
 

@@ -72,7 +72,6 @@ def _volumes(ray_direction: wp.vec3, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 
 @wp.func
 def _is_hit(ray_direction: wp.vec3, a: wp.vec3d, face_normal: wp.vec3d, volumes: wp.vec3d):
-    """Whether a ray meets a face."""
     is_inside = wp.min(volumes) >= wp.float64(0.0) or wp.max(volumes) <= wp.float64(0.0)
     return is_inside and wp.dot(face_normal, a) * wp.dot(face_normal, wp.vec3d(ray_direction)) > wp.float64(0.0)
 
