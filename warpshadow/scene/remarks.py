@@ -48,7 +48,6 @@ def misplacements(scene: Scene) -> list[str]:
 
     Where nothing stands on any ground, it is said of bodies beside that are broader, too: they may be in other units.
 
-
     Grounds are flat, face +y and emit no light; the size is the longest edge of the bounds. A body over another that is
     near enough, a cup on a table, does not float; nor does a lamp, or a body whose bounds meet those of a lamp, such as
     its shade. A body over one ground does not lie below another, such as the board of a table.
