@@ -19,7 +19,7 @@ _ON_SURFACE = 3.0e-4
 part is a chord of a bent surface, its gap is added."""
 
 _ROUNDING = 1.0e-6
-"""The same, over the distance of the part from the origin: several times that of float32."""
+"""Height, over the distance of the part from the origin, up to which a receiver lies on a face: float32 rounds so."""
 
 
 @wp.struct
