@@ -18,7 +18,7 @@ from warpshadow.stages.receivers.sample_receivers import Span
 
 
 class GlossyPoints(LitPoints):
-    """The receivers of a view on bodies that shine, all of which pixels see.
+    """The receivers of a view on bodies that shine; pixels see them all.
 
     Args:
         view: The view.
@@ -78,7 +78,7 @@ def _cut_spans(array: wp.array, spans: list[Span], first: int) -> wp.array:
 
 
 def _select_receivers(is_glossy: np.ndarray, receivers: Receivers) -> Receivers:
-    """Select the glossy receivers of a view, all of which pixels see. Differentiable: points, normals."""
+    """Select the glossy receivers of a view; pixels see them all. Differentiable: points, normals."""
     spans, count = _find_glossy_spans(is_glossy, receivers), 0
     assert receivers.vertices is not None
     at_vertices, samples = receivers.vertices.size, receivers.sample_fragments
