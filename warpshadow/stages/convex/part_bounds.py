@@ -11,8 +11,7 @@ from warpshadow.stages.convex.joint_lanes import coverage_type, sums_type
 from warpshadow.stages.convex.silhouette import silhouette_type
 from warpshadow.stages.visibility.culling import DirectionCells
 
-_BOUND_MARGIN = 1.001
-"""Bounds are so much larger, for rounding."""
+_BOUND_MARGIN = 1.001  # bounds are so much larger, for rounding
 
 _ON_SURFACE = 3.0e-4
 """Height above a face up to which a receiver lies on it, over the radius of the part: faces are flat to 1e-4. Where the
