@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import warpshadow as ws
-from warpshadow.pipeline.receivers.groups import find_groups
+from warpshadow.pipeline.receivers.groups import find_portions
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.torch import TorchRenderer
 
@@ -95,7 +95,7 @@ def _groups(renderer: SceneRenderer) -> list:
     blockers = renderer._method.scene_blockers.place_blockers(
         view.blocker_kinds, view.vertices.value(), view.spheres.value()
     )
-    return find_groups(view.static_bodies, view.nearest_spheres, view.receivers, blockers, {}, None, None)
+    return list(find_portions(view.receivers, blockers, static_bodies=None, nearest_spheres=None))
 
 
 def test_where_shadows_are_kept_at_vertices_they_stay_there():

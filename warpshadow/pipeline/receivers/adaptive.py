@@ -15,7 +15,7 @@ from warpshadow.device.constants import immutable
 from warpshadow.device.launch import without_gradient
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.receivers.groups import Blockers, Group
-from warpshadow.pipeline.receivers.lit_points import VisibleSurfaces
+from warpshadow.pipeline.receivers.lit_points import AdaptiveSurfaces
 from warpshadow.stages.receivers.find import points_of_fragments
 from warpshadow.stages.receivers.quadtree import Quadtree, find_quadtree, probe_grid
 from warpshadow.stages.receivers.sample_receivers import fragments_of_samples
@@ -24,7 +24,7 @@ from warpshadow.stages.receivers.sample_receivers import fragments_of_samples
 def find_squares(
     place_blockers: Callable[[wp.array, tuple[wp.array, wp.array]], Blockers],
     share_of_sharpest_light: Callable[[Group], np.ndarray | None],
-    surfaces: VisibleSurfaces,
+    surfaces: AdaptiveSurfaces,
 ) -> Quadtree:
     """Find the squares of images in which the samples of some bodies interpolate.
 

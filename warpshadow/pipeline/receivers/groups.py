@@ -273,35 +273,38 @@ def _choose_blocking(
     return chosen if set(chosen) - {body} else (), bodies.index(body) if body in bodies else None
 
 
-def find_groups(
-    static_bodies: StaticBodies | None,
-    nearest_spheres: np.ndarray | None,
+def find_portions(
     receivers: Receivers,
     blockers: Blockers,
-    self_lookups: dict[int, Any] | None,
-    cached_rows: CachedRows | None,
-    static_normals: wp.array | None,
-) -> list[Group]:
-    """Put receivers into groups.
+    self_lookups: dict[int, Any] | None = None,
+    cached_rows: CachedRows | None = None,
+    static_normals: wp.array | None = None,
+    *,
+    static_bodies: StaticBodies | None,
+    nearest_spheres: np.ndarray | None,
+) -> Iterator[Group]:
+    """Put receivers into groups, and cut these into portions.
 
     Args:
-        static_bodies, nearest_spheres: As of the :class:`LitPoints` that they are.
         receivers: All of them.
         blockers: Their surroundings.
         self_lookups: Self-visibility of receivers, by body; None without any.
         cached_rows: Cached transmittance past static bodies, for receivers on them.
         static_normals: Normals of all vertices of static bodies; None where any may move.
+        static_bodies, nearest_spheres: As of the :class:`LitPoints` that they are.
     """
-    groups = list(_groups_that_move(receivers, blockers, self_lookups or {}, nearest_spheres))
-    if static_bodies is None or not len(receivers.static_vertices):
-        return groups
-    assert static_normals is not None
-    moving = static_bodies.moving
-    points_and_normals = static_bodies.receivers(receivers.static_vertices, static_normals)
-    planes, parts = blockers.planes_around(of_bodies=moving), blockers.convex_parts_around(of_bodies=moving)
-    spheres = blockers.spheres_of(moving)
-    group = Group(*points_and_normals, *spheres, cached_rows, planes=planes, convex_parts_around=parts)
-    return [group, *groups] if receivers.points.shape[1] else [group]
+    if static_bodies is not None and len(receivers.static_vertices):
+        assert static_normals is not None
+        moving = static_bodies.moving
+        points_and_normals = static_bodies.receivers(receivers.static_vertices, static_normals)
+        planes, parts = blockers.planes_around(of_bodies=moving), blockers.convex_parts_around(of_bodies=moving)
+        spheres = blockers.spheres_of(moving)
+        group = Group(*points_and_normals, *spheres, cached_rows, planes=planes, convex_parts_around=parts)
+        yield from group.portions()
+        if not receivers.points.shape[1]:
+            return
+    for group in _groups_that_move(receivers, blockers, self_lookups or {}, nearest_spheres):
+        yield from group.portions()
 
 
 def _groups_that_move(

@@ -41,7 +41,7 @@ class BlockerKinds(NamedTuple):
         return {*self.self_traced, *self.solids, *self.planes}
 
 
-class VisibleSurfaces(NamedTuple):
+class AdaptiveSurfaces(NamedTuple):
     """Surfaces that the samples of an image see, some of them by adaptive receivers."""
 
     positions: wp.array  # of all vertices, vec3 of shape [batch, vertex]

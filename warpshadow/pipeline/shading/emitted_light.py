@@ -38,21 +38,21 @@ vertices in a room with a lamp were 16.6 and 3.2% off in direct light in place o
 def find_emitted_light(
     emitters: EmitterSamples,
     self_visibility: Sequence[EmitterSelfVisibility | None],
-    groups: Iterable[Group],
+    portions: Iterable[Group],
     blockers: Blockers,
     placed_samples: PlacedSamples,
     radiance: wp.array,
 ) -> wp.array:
-    """Direct light of emitters on groups of receivers, vec3 of shape [batch, receiver].
+    """Direct light of emitters on receivers, vec3 of shape [batch, receiver].
 
     Args:
         emitters: Their samples.
         self_visibility: Of each; None of one that hides nothing of itself.
-        groups: The receivers, with the self-visibility of their bodies in EMITTER_CELLS.
+        portions: The receivers, with the self-visibility of their bodies in EMITTER_CELLS.
         blockers: All of them.
         placed_samples: Where the samples are.
         radiance: Of the samples, vec3 of shape [batch, sample].
-    Differentiable: blockers, receivers of the groups, placed_samples, radiance.
+    Differentiable: blockers, receivers of the portions, placed_samples, radiance.
     """
 
     def light_of(portion: Group) -> wp.array:
@@ -62,29 +62,29 @@ def find_emitted_light(
             total = add_light(total, sum_light(*lit, *pair))
         return total
 
-    return join_portions([light_of(portion) for group in groups for portion in group.portions()])
+    return join_portions(list(map(light_of, portions)))
 
 
 def find_highlights(
     emitters: EmitterSamples,
     self_visibility: Sequence[EmitterSelfVisibility | None],
-    groups: Iterable[Group],
+    portions: Iterable[Group],
     blockers: Blockers,
     placed_samples: PlacedSamples,
     radiance: wp.array,
     roughness: wp.array,
     clip_matrices: wp.array,
 ) -> LobeLight:
-    """Direct light of emitters in the lobes of groups of receivers (:mod:`.stages.gloss.highlights`).
+    """Direct light of emitters in the lobes of receivers (:mod:`.stages.gloss.highlights`).
 
     Args:
-        emitters, self_visibility, groups, blockers, placed_samples, radiance: As for :func:`find_emitted_light`.
-        roughness: Of all receivers of the groups, float32 of shape [batch, receiver].
+        emitters, self_visibility, portions, blockers, placed_samples, radiance: As for :func:`find_emitted_light`.
+        roughness: Of all receivers, float32 of shape [batch, receiver].
         clip_matrices: Cameras, mat44 of shape [batch].
     Differentiable: as that, and roughness and clip_matrices.
     """
     sums, first = [], 0
-    for portion in (portion for group in groups for portion in group.portions()):
+    for portion in portions:
         end = first + portion.points.shape[1]
         seen = portion.points, portion.normals, cut(roughness, first, end), clip_matrices
         zeros = wp.zeros(portion.points.shape, dtype=wp.vec3, device=portion.points.device)

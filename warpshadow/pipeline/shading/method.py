@@ -19,9 +19,9 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
 from warpshadow.pipeline.receivers.lit_points import (
     ONLY_SPHERES,
+    AdaptiveSurfaces,
     BlockerKinds,
     LitPoints,
-    VisibleSurfaces,
     receiver_text,
 )
 from warpshadow.pipeline.shading.light_input import LightInput
@@ -87,7 +87,7 @@ class Method(abc.ABC):
         """
         return ONLY_SPHERES
 
-    def find_squares(self, blocker_kinds: BlockerKinds, surfaces: VisibleSurfaces) -> Quadtree | None:
+    def find_squares(self, blocker_kinds: BlockerKinds, surfaces: AdaptiveSurfaces) -> Quadtree | None:
         """Find the squares in which samples of adaptive bodies interpolate (:func:`.adaptive.find_squares`)."""
         return None
 

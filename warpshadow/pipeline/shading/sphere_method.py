@@ -15,8 +15,8 @@ from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached
-from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_groups
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, VisibleSurfaces, receiver_text
+from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_portions
+from warpshadow.pipeline.receivers.lit_points import AdaptiveSurfaces, BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.method import Method
@@ -169,7 +169,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         transfer = self.transfer(visibility, group, projected_light)
         return self.shade_transfer(transfer, group, projected_light)
 
-    def find_squares(self, blocker_kinds: BlockerKinds, surfaces: VisibleSurfaces) -> Quadtree:
+    def find_squares(self, blocker_kinds: BlockerKinds, surfaces: AdaptiveSurfaces) -> Quadtree:
         """Find the squares in which samples of adaptive bodies interpolate."""
         from warpshadow.pipeline.receivers.adaptive import find_squares
 
@@ -204,13 +204,13 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         self, name: str, find: Callable[..., Any], points: LitPoints, materials: Materials, *others: Node | Input
     ) -> Node:
         emitters, weak_points = self.emitters, points.weak
-        bodies_and_spheres = points.static_bodies, points.nearest_spheres
+        portions_of = _find_portions_of(points)
 
-        def find_in_groups(
+        def find_in_portions(
             receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any] | None, *arrays: Any
         ) -> Any:
-            groups = find_groups(*bodies_and_spheres, receivers, blockers, self_lookups, None, None)
-            return find(emitters.samples, emitters.self_visibility, groups, blockers, *arrays)
+            portions = portions_of(receivers, blockers, self_lookups)
+            return find(emitters.samples, emitters.self_visibility, portions, blockers, *arrays)
 
         def lookups() -> Node:
             if self.emitter_cells is None:
@@ -219,7 +219,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
 
         return Node(
             name,
-            find_in_groups,
+            find_in_portions,
             points.receivers_node,
             blockers_node(self, points),
             points.cached_of_bodies("self-visibility towards emitters", None, lookups),
@@ -291,7 +291,7 @@ class PortionedVisibility(Node):
         caches: bool = True,
         suffix: str | None = None,
     ):
-        self.method, self._bodies_and_spheres = method, (points.static_bodies, points.nearest_spheres)
+        self.method, self._portions_of = method, _find_portions_of(points)
         self._progress, weak_points = method.progress and light is not None, points.weak
         suffix, planes = points.suffix if suffix is None else suffix, points.blocker_kinds.planes
         item_text = functools.partial(receiver_text, weak_points)
@@ -337,13 +337,12 @@ class PortionedVisibility(Node):
     def portions(self, call: Call) -> Iterator[Any]:
         """Find it for one portion after another."""
         receivers, blockers, projected_light, *cached = self.values(call)
-        groups = find_groups(*self._bodies_and_spheres, receivers, blockers, *cached)
         total = len(receivers.static_vertices) + receivers.points.shape[1]
         with progress_bar(total, "shading", "receiver", shows=self._progress) as bar:
-            for part in (part for group in groups for part in group.portions()):
-                portion = LitPortion(part, self._find_visibility(call, part, projected_light), blockers.spheres)
+            for group in self._portions_of(receivers, blockers, *cached):
+                portion = LitPortion(group, self._find_visibility(call, group, projected_light), blockers.spheres)
                 yield self.result_of(self.add_step(call, portion, projected_light))
-                bar.update(part.points.shape[1])
+                bar.update(group.points.shape[1])
 
     def _find_visibility(
         self, call: Call, group: Group, projected_light: ProjectedLight
@@ -401,6 +400,11 @@ class PortionedShading(PortionedTransfer):
                 else self.method.shade_transfer(transfer, portion.group, projected_light)
             )
         return portion._replace(result=result)
+
+
+def _find_portions_of(points: LitPoints) -> Callable[..., Iterator[Group]]:
+    """Make :func:`find_portions` for the receivers of points, without a reference to these."""
+    return functools.partial(find_portions, static_bodies=points.static_bodies, nearest_spheres=points.nearest_spheres)
 
 
 def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:

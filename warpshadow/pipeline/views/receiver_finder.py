@@ -7,7 +7,7 @@ import warp as wp
 
 from warpshadow.device.constants import gather_of_owners
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds, VisibleSurfaces
+from warpshadow.pipeline.receivers.lit_points import AdaptiveSurfaces, BlockerKinds
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.method import Method
@@ -82,7 +82,7 @@ class ReceiverFinder:
             at_samples = at_samples & ~has_cached_rows
             numbering = self._number_seen(seen_vertices(fragments, silhouettes, positions.shape[1]), has_cached_rows)
             if spheres is not None and (is_adaptive := scene_receivers.is_adaptive & at_samples).any():
-                surfaces = VisibleSurfaces(
+                surfaces = AdaptiveSurfaces(
                     positions, normals, fragments, spheres, is_adaptive, self._supersampling, footprints_of
                 )
                 quadtree = method.find_squares(self._blocker_kinds, surfaces)
