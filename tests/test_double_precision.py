@@ -121,15 +121,15 @@ def test_gradients_of_poses_of_points_are_exact(double, device, check, poses):
     )
 
 
-def test_gradients_of_poses_of_radii_are_exact(double, device, check, poses):
+@pytest.mark.parametrize("quantity", [0, 1])
+def test_gradients_of_poses_of_spheres_are_exact(quantity, double, device, check, poses):
     bodies = put(np.int32([0, 2, 1, 2]), wp.int32, device)
-    rotations, translations, scales = poses
+    spheres = (wp.vec3d, random(3, 1, 4, 3)), (wp.float64, random(4, 1, 4))
 
-    def radii(rest, scales):
-        fixed = [put(values, dtype, device) for dtype, values in (rotations, translations)]
-        return double("stages.geometry.poses").Poses(*fixed, scales).radii(rest, bodies)
+    def moved(centers, radii, *poses):
+        return double("stages.geometry.poses").Poses(*poses).spheres(centers, radii, bodies)[quantity]
 
-    check(radii, (wp.float64, random(3, 1, 4)), scales)
+    check(moved, *spheres, *poses)
 
 
 @pytest.mark.parametrize("quantity", ["points", "centers", "rigidity", "shear"])

@@ -276,7 +276,7 @@ def descend(method: str, learning_rate: float, steps: int, device: str = "cpu") 
         loss = wp.zeros(1, dtype=wp.float32, device=device, requires_grad=True)
         with wp.Tape() as tape:
             poses = Poses(rotation_matrices(turns), shifts, scales)
-            points, moved, sizes = poses.points(rest[0], whole), poses.points(rest[1], own), poses.radii(rest[2], own)
+            points, moved, sizes = poses.placed(rest[0], whole, rest[1], rest[2], own)
             normals = vertex_normals(points, faces)
             if method == "directional":
                 seen = transmittance(points, normals, moved, sizes, directions)

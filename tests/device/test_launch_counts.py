@@ -15,10 +15,10 @@ from warpshadow.tuning.timing import whole_image
 # Kernels and memory sets; they may fall. Parts are put together by NumPy on a CPU, on a GPU by a kernel for each.
 # Two find the footprints of receivers, for the image and for probes of squares.
 MOST = {
-    "image": (42, 8),
-    "pose iteration": (65, 5),
-    "image with two bounces": (87, 11),
-    "pose iteration with two bounces": (154, 13),
+    "image": (40, 8),
+    "pose iteration": (62, 5),
+    "image with two bounces": (85, 11),
+    "pose iteration with two bounces": (151, 13),
 }
 MOST_OF_A_BOX = 39  # kernels that a box more takes where light bounces twice, for its receivers and its patch samples
 

@@ -168,27 +168,36 @@ def test_rotations_of_another_type_are_refused(device):
 def test_bodies_move_as_one_and_their_gradients_are_those_of_the_twin(device, verified_tape):
     rng = np.random.default_rng(1)
     rest, radii, bodies = rng.normal(size=(1, 9, 3)), rng.random((1, 9)), np.arange(9) % 3
+    centers = rng.normal(size=(1, 9, 3))
     rotations = Rotation.random(6, random_state=1).as_matrix().reshape(2, 3, 3, 3)
     translations, scales = rng.normal(size=(2, 3, 3)), rng.uniform(0.5, 2, (2, 3))
-    weights, radius_weights = rng.normal(size=(2, 9, 3)), rng.normal(size=(2, 9))
+    weights, center_weights, radius_weights = *rng.normal(size=(2, 2, 9, 3)), rng.normal(size=(2, 9))
 
-    def twin(rest, rotations, translations, scales, radii):
-        moved = (
-            np.einsum("bpij,opj->bpi", rotations[:, bodies], rest) * scales[:, bodies, None] + translations[:, bodies]
-        )
-        return np.sum(weights * moved) + np.sum(radius_weights * scales[:, bodies] * radii)
+    def twin(rest, rotations, translations, scales, radii, centers):
+        def moved(points):
+            rotated = np.einsum("bpij,opj->bpi", rotations[:, bodies], points)
+            return rotated * scales[:, bodies, None] + translations[:, bodies]
 
-    values = [rest, rotations, translations, scales, radii]
-    dtypes = [wp.vec3, wp.mat33, wp.vec3, wp.float32, wp.float32]
+        radius_sum = np.sum(radius_weights * scales[:, bodies] * radii)
+        return np.sum(weights * moved(rest)) + np.sum(center_weights * moved(centers)) + radius_sum
+
+    values = [rest, rotations, translations, scales, radii, centers]
+    dtypes = [wp.vec3, wp.mat33, wp.vec3, wp.float32, wp.float32, wp.vec3]
     arrays = [put(value, dtype, device) for value, dtype in zip(values, dtypes, strict=True)]
     members = wp.array(bodies.astype(np.int32), device=device)
     with wp.Tape() as tape:
         poses = Poses(*arrays[1:4])
-        points, posed_radii = poses.points(arrays[0], members), poses.radii(arrays[4], members)
+        moved = poses.placed(arrays[0], members, arrays[5], arrays[4], members)
+        separate = poses.points(arrays[0], members), *poses.spheres(arrays[5], arrays[4], members)
+    for one, other in zip(moved, separate, strict=True):
+        np.testing.assert_array_equal(one.numpy(), other.numpy())
+    points, posed_centers, posed_radii = moved
     points.grad.assign(weights.astype(np.float32))
+    posed_centers.grad.assign(center_weights.astype(np.float32))
     posed_radii.grad.assign(radius_weights.astype(np.float32))
     tape.backward()
-    total = np.sum(weights * points.numpy()) + np.sum(radius_weights * posed_radii.numpy())
+    total = np.sum(weights * points.numpy()) + np.sum(center_weights * posed_centers.numpy())
+    total += np.sum(radius_weights * posed_radii.numpy())
     assert abs(total - twin(*values)) < 10 * FLOAT32
     for k, array in enumerate(arrays):
         expected = central_differences(lambda v, k=k: twin(*values[:k], v, *values[k + 1 :]), values[k])

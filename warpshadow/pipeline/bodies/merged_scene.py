@@ -322,16 +322,16 @@ class MergedScene:
         numbers = None if moving is None else self.scene.body_numbers(moving, "moving")
         turned = None if rest.rotations is None else poses.turned(rest.rotations)
         if numbers is None or rest.moving is None:
-            return Geometry(
-                poses.points(rest.positions, self._vertex_bodies),
-                poses.points(rest.centers, self._sphere_bodies),
-                poses.radii(rest.radii, self._sphere_bodies),
-                rotations=turned,
-                deformed=rest.deformed,
-            )
+            spheres = rest.centers, rest.radii, self._sphere_bodies
+            arrays = poses.placed(rest.positions, self._vertex_bodies, *spheres)
+            return Geometry(*arrays, rotations=turned, deformed=rest.deformed)
         bodies = {*numbers, *rest.moving}
-        vertices, spheres = self.runs(self.first_vertex, bodies), self.runs(self.first_sphere, bodies)
+        vertices, sphere_runs = self.runs(self.first_vertex, bodies), self.runs(self.first_sphere, bodies)
         static = self.scene_geometry
+        moved = {
+            (a, b): poses.spheres(rest.centers[:, a:b], rest.radii[:, a:b], self._sphere_bodies[a:b])
+            for a, b in sphere_runs
+        }
         if turned is not None:
             assert static.rotations is not None
             every, given_rotations = self.runs(np.arange(len(self.scene.bodies) + 1), bodies), turned
@@ -340,8 +340,8 @@ class MergedScene:
             splice(
                 static.positions, vertices, lambda a, b: poses.points(rest.positions[:, a:b], self._vertex_bodies[a:b])
             ),
-            splice(static.centers, spheres, lambda a, b: poses.points(rest.centers[:, a:b], self._sphere_bodies[a:b])),
-            splice(static.radii, spheres, lambda a, b: poses.radii(rest.radii[:, a:b], self._sphere_bodies[a:b])),
+            splice(static.centers, sphere_runs, lambda a, b: moved[a, b][0]),
+            splice(static.radii, sphere_runs, lambda a, b: moved[a, b][1]),
             moving=tuple(bodies),
             rotations=turned,
             deformed=rest.deformed,

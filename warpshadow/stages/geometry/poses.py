@@ -14,38 +14,34 @@ from warpshadow.stages.geometry.rotations import check_orthonormal
 
 
 @wp.kernel
-def _pose_points(
+def _pose(
     # in
     rest: wp.array2d(dtype=wp.vec3),
     bodies: wp.array(dtype=wp.int32),
+    rest_centers: wp.array2d(dtype=wp.vec3),
+    rest_radii: wp.array2d(dtype=wp.float32),
+    sphere_bodies: wp.array(dtype=wp.int32),
     rotations: wp.array2d(dtype=wp.mat33),
     translations: wp.array2d(dtype=wp.vec3),
     scales: wp.array2d(dtype=wp.float32),
     # out
     posed: wp.array2d(dtype=wp.vec3),
+    centers: wp.array2d(dtype=wp.vec3),
+    radii: wp.array2d(dtype=wp.float32),
 ):
-    """A thread owns a point of an instance."""
-    batch, point = wp.tid()
-    body = bodies[point]
+    """A thread owns a point of an instance, or one of the spheres that follow; the two may differ in their batch."""
+    batch, item = wp.tid()
     pose_batch = instance_in(batch, scales.shape[0])
-    rest_value = rest[instance_in(batch, rest.shape[0]), point]
-    rotated = rotations[pose_batch, body] * rest_value
-    posed[batch, point] = scales[pose_batch, body] * rotated + translations[pose_batch, body]
-
-
-@wp.kernel
-def _pose_radii(
-    # in
-    rest: wp.array2d(dtype=wp.float32),
-    bodies: wp.array(dtype=wp.int32),
-    scales: wp.array2d(dtype=wp.float32),
-    # out
-    posed: wp.array2d(dtype=wp.float32),
-):
-    """A thread owns a sphere of an instance."""
-    batch, sphere = wp.tid()
-    scale = scales[instance_in(batch, scales.shape[0]), bodies[sphere]]
-    posed[batch, sphere] = scale * rest[instance_in(batch, rest.shape[0]), sphere]
+    sphere = item - bodies.shape[0]
+    if sphere < 0 and batch < posed.shape[0]:
+        body = bodies[item]
+        rotated = rotations[pose_batch, body] * rest[instance_in(batch, rest.shape[0]), item]
+        posed[batch, item] = scales[pose_batch, body] * rotated + translations[pose_batch, body]
+    if sphere >= 0 and batch < radii.shape[0]:
+        body = sphere_bodies[sphere]
+        rotated = rotations[pose_batch, body] * rest_centers[instance_in(batch, rest_centers.shape[0]), sphere]
+        centers[batch, sphere] = scales[pose_batch, body] * rotated + translations[pose_batch, body]
+        radii[batch, sphere] = scales[pose_batch, body] * rest_radii[instance_in(batch, rest_radii.shape[0]), sphere]
 
 
 @wp.kernel
@@ -135,23 +131,53 @@ class Poses:
         """Move points with their bodies.
 
         Args:
-            rest: Vertices or centers at rest [scene units], vec3 of shape [batch, point]; rest or poses may have a
-                batch of 1, which then serves every instance of the other.
+            rest: Vertices at rest [scene units], vec3 of shape [batch, point]; rest or poses may have a batch of 1,
+                which then serves every instance of the other.
             bodies: Body of each point, int32 of shape [point].
         Returns:
             vec3 of shape [batch, point].
         Differentiable: rest, rotations, translations, scales.
         """
-        posed = empty(self._shape(rest, bodies), dtype=wp.vec3, device=rest.device)
-        inputs = [rest, bodies, self.rotations, self.translations, self.scales]
-        launch(_pose_points, posed.shape, inputs=inputs, outputs=[posed])
-        return posed
+        return self.placed(rest, bodies, None, None, None)[0]
 
-    def radii(self, rest: wp.array, bodies: wp.array) -> wp.array:
-        """Scale radii, float32 of shape [batch, sphere], with their bodies. Differentiable: rest, scales."""
-        posed = empty(self._shape(rest, bodies), dtype=wp.float32, device=rest.device)
-        launch(_pose_radii, posed.shape, inputs=[rest, bodies, self.scales], outputs=[posed])
-        return posed
+    def spheres(self, centers: wp.array, radii: wp.array, bodies: wp.array) -> tuple[wp.array, wp.array]:
+        """Move spheres with their bodies: centers as points, radii float32 of shape [batch, sphere].
+
+        Differentiable: centers, radii, rotations, translations, scales.
+        """
+        return self.placed(None, None, centers, radii, bodies)[1:]
+
+    def placed(
+        self,
+        rest: wp.array | None,
+        bodies: wp.array | None,
+        centers: wp.array | None,
+        radii: wp.array | None,
+        sphere_bodies: wp.array | None,
+    ) -> tuple[wp.array, wp.array, wp.array]:
+        """Move points and spheres at once, arguments of :meth:`points` and :meth:`spheres`, None where there are none.
+
+        Differentiable likewise.
+        """
+        poses = {"rotations": self.rotations, "translations": self.translations, "scales": self.scales}
+        arrays = {"rest": rest, "centers": centers, "radii": radii}
+        finite_arrays(arrays | poses, nonnegative=["scales"])
+        point_shape, sphere_shape = (0, 0), (0, 0)
+        if rest is not None and bodies is not None:
+            check.shape("rest", rest.shape, ("batch", bodies.shape[0]))
+            point_shape = common_batch({"rest": rest, "scales": self.scales}), bodies.shape[0]
+        if centers is not None and radii is not None and sphere_bodies is not None:
+            check.shape("centers", centers.shape, ("batch", sphere_bodies.shape[0]))
+            check.shape("radii", radii.shape, ("batch", sphere_bodies.shape[0]))
+            batch_count = common_batch({"centers": centers, "radii": radii, "scales": self.scales})
+            sphere_shape = batch_count, sphere_bodies.shape[0]
+        device = self.scales.device
+        points, posed_centers = (empty(shape, dtype=wp.vec3, device=device) for shape in (point_shape, sphere_shape))
+        posed_radii = empty(sphere_shape, dtype=wp.float32, device=device)
+        dim = max(point_shape[0], sphere_shape[0]), point_shape[1] + sphere_shape[1]
+        inputs = [rest, bodies, centers, radii, sphere_bodies, *poses.values()]
+        launch(_pose, dim, inputs=inputs, outputs=[points, posed_centers, posed_radii])
+        return points, posed_centers, posed_radii
 
     def turned(self, rest: wp.array) -> wp.array:
         """Compose rotations with rotations at rest, mat33 of shape [batch, body]. Differentiable: rest, rotations."""
@@ -159,9 +185,3 @@ class Poses:
         rotated = empty((batch_count, rest.shape[1]), dtype=wp.mat33, device=rest.device)
         launch(_compose_rotations, rotated.shape, inputs=[rest, self.rotations], outputs=[rotated])
         return rotated
-
-    def _shape(self, rest: wp.array, bodies: wp.array) -> tuple[int, int]:
-        check.shape("rest", rest.shape, ("batch", bodies.shape[0]))
-        arrays = {"rest": rest, "rotations": self.rotations, "translations": self.translations, "scales": self.scales}
-        finite_arrays(arrays, nonnegative=["scales"])
-        return common_batch({"rest": rest, "scales": self.scales}), bodies.shape[0]
