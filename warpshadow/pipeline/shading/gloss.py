@@ -96,11 +96,14 @@ class GlossyPoints(LitPoints):
         samples = self.cached("lobes", materials.roughness, sample)
         directions, filters = field_of(samples, "directions"), field_of(samples, "filters")
         texels = self._prefiltered(light)
-        shell, exits = self.method.shell_of(light), directions
-        if shell is not None:
-            exits = Node("", exits_from_shell, field_of(self.receivers_node, "points"), directions, shell)
-        radiance = Node("prefiltered light", look_up_light, texels, exits, filters, items=item_text)
+        radiance = self._look_up("prefiltered light", light, texels, directions, filters)
         transmittance = visibility.transmittance(lobes, directions)
+        if blocked is not None and visibility.traces_hits and materials.may_be_metal:
+            from warpshadow.pipeline.shading.mirrored_bodies import find_mirrored_radiance
+
+            texels = texels if light.is_free else visibility.prefiltered(self, light, with_suns=True)
+            look_up = functools.partial(self._look_up, "", light, texels)
+            blocked = find_mirrored_radiance(self, materials, samples, transmittance, blocked, look_up)
         lobe_light = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, items=item_text)
         suns = visibility.suns(self, light)
         if suns is not None:
@@ -114,6 +117,14 @@ class GlossyPoints(LitPoints):
         of_surface = field_of(samples, "cosines"), values["metallic"], values["specular"]
         mix = Node("reflection", mix_reflection, self._numbers, diffuse, *light_in_lobes, *of_surface, items=item_text)
         return field_of(mix, "colored"), field_of(mix, "white")
+
+    def _look_up(self, name: str, light: LightInput, texels: Node, directions: Node, filters: Node) -> Node:
+        """Node of light without shadows from directions, vec3 of shape [batch, receiver, sample]."""
+        shell = self.method.shell_of(light)
+        if shell is not None:
+            directions = Node("", exits_from_shell, field_of(self.receivers_node, "points"), directions, shell)
+        items = functools.partial(receiver_text, self.weak)
+        return Node(name, look_up_light, texels, directions, filters, items=items)
 
     def select(self, light: Node) -> Node:
         """Select the light on these receivers from that on all receivers of the view; a node."""
