@@ -39,9 +39,9 @@ def find_mirrored_radiance(
     merged_scene, faces = points.merged_scene, points.merged_scene.faces
     directions = field_of(samples, "directions")
     find = functools.partial(_find_hits, merged_scene, _mirror_faces(merged_scene, materials))
-    lit = points.vertices, points.normals, points.receivers_node, directions, transmittance
+    traced = points.vertices, points.normals, points.receivers_node, directions, transmittance
     items = functools.partial(receiver_text, points.weak)
-    hits = Node("hits of lobes", find, *(detached(each) for each in lit), items=items)
+    hits = Node("hits of lobes", find, *(detached(source) for source in traced), items=items)
     roughness, albedo, metallic = (materials.of_vertices(name) for name in ("roughness", "albedo", "metallic"))
     mirrored = Node("", mirror, hits, faces, roughness, directions, field_of(samples, "filters"))
     filters = field_of(mirrored, "filters")
