@@ -12,6 +12,7 @@ import warp as wp
 import warpshadow as ws
 from warpshadow import inverse
 from warpshadow.inverse.uncertainty import NormalMatrix
+from warpshadow.maths import sh
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bounces import static_form_factors
 from warpshadow.pipeline.methods.directional import Directional
@@ -309,6 +310,18 @@ def test_a_metal_reflects_the_ground_where_light_bounces(render):
     scene = dataclasses.replace(scene_of(metal, ground), light=ws.EnvironmentMap.constant(1.0), camera=NEAR)
     direct, bounced = (render(dataclasses.replace(scene, bounces=count))[..., :3].mean() for count in (0, "all"))
     assert direct < 0.9 and 0.95 < bounced < 1.03
+
+
+def test_a_metal_that_a_metal_mirrors_shows_the_sky_that_it_mirrors():
+    """A corner of two mirrors sends the light from behind the viewer back; diffuse patches would send two fifths."""
+    color, options = np.array([0.9, 0.6, 0.3]), {"roughness": 0.2, "metallic": 1.0}
+    ground = ws.Body(ws.plane(4.0, 8), color, name="ground", **options)
+    wall = ws.Body(ws.plane(4.0, 8), color, rotation=(90, 0, 0), translation=(0, 2, -2), name="wall", **options)
+    is_bright = sh.equirectangular_directions(32) @ np.array([0, 1, 1]) / np.sqrt(2) > np.cos(np.radians(40))
+    light = ws.EnvironmentMap(np.where(is_bright[..., None], 2.0, 0.05).astype(np.float32).repeat(3, axis=2))
+    camera = ws.Camera.look_at((0, 5, 3.5), (0, 0, -1.5), fov_y=4, size=(8, 8))
+    image = ws.render(ws.Scene([ground, wall], light, camera, bounces=2))[..., :3]
+    np.testing.assert_allclose(image.mean(axis=(0, 1)), 2.0 * color**2, rtol=0.05)
 
 
 TILES = dataclasses.replace(GROUND, roughness=0.4, metallic=0.6)

@@ -71,11 +71,14 @@ def mix_gloss(
     samples = points.cached("lobes", materials.roughness, sample)
     directions, filters = field_of(samples, "directions"), field_of(samples, "filters")
     texels = _prefiltered(method, points, light)
-    shell, exits = method.shell_of(light), directions
-    if shell is not None:
-        exits = Node("", exits_from_shell, field_of(points.receivers_node, "points"), directions, shell)
-    radiance = Node("prefiltered light", look_up_light, texels, exits, filters, items=item_text)
+    radiance = _look_up(method, points, "prefiltered light", light, texels, directions, filters)
     transmittance = visibility.transmittance(lobes, directions)
+    if blocked is not None and visibility.traces_hits and materials.may_be_metal:
+        from warpshadow.pipeline.shading.mirrored_bodies import find_mirrored_radiance
+
+        texels = texels if light.is_free else visibility.prefiltered(points, light, with_suns=True)
+        look_up = functools.partial(_look_up, method, points, "", light, texels)
+        blocked = find_mirrored_radiance(points, materials, samples, transmittance, blocked, look_up)
     lobe_light = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, items=item_text)
     suns = visibility.suns(points, light)
     if suns is not None:
@@ -89,6 +92,17 @@ def mix_gloss(
     of_surface = field_of(samples, "cosines"), values["metallic"], values["specular"]
     mix = Node("reflection", mix_reflection, points.numbers, diffuse, *light_in_lobes, *of_surface, items=item_text)
     return field_of(mix, "colored"), field_of(mix, "white")
+
+
+def _look_up(
+    method: Method, points: GlossyPoints, name: str, light: LightInput, texels: Node, directions: Node, filters: Node
+) -> Node:
+    """Node of light without shadows from directions, vec3 of shape [batch, receiver, sample]."""
+    shell = method.shell_of(light)
+    if shell is not None:
+        directions = Node("", exits_from_shell, field_of(points.receivers_node, "points"), directions, shell)
+    items = functools.partial(receiver_text, points.weak)
+    return Node(name, look_up_light, texels, directions, filters, items=items)
 
 
 def _find_values(points: GlossyPoints, materials: Materials, name: str) -> Node:

@@ -41,6 +41,7 @@ class LobeVisibility:
     | :meth:`sun_transmittance` | suns | :meth:`transmittance` in :attr:`sun_sample_count` directions of each |
     | :meth:`blocked_radiance` | light that bounces | refused |
     | :attr:`sample_count`, :attr:`sun_sample_count` | the noise of its shadows | 32; 1 |
+    | :attr:`traces_hits` | metals that lobes meet reflect light once more | no: all blockers have one radiance |
 
     Args:
         merged_scene: The bodies.
@@ -53,6 +54,8 @@ class LobeVisibility:
     16 (roughness 0.35)."""
 
     sun_sample_count = 1  # directions in which each sun is looked for from the lobe of a receiver
+
+    traces_hits = False  # whether rays say which bodies lobes meet
 
     def __init__(self, merged_scene: MergedScene, scene_light: LightInput, *, shares_receivers: bool):
         self._merged_scene, self._scene_light = merged_scene, scene_light
@@ -87,10 +90,12 @@ class LobeVisibility:
         separated = self._separated(points, light)
         return None if separated is None else field_of(separated, "suns")
 
-    def prefiltered(self, points: LitPoints, light: LightInput) -> Node:
-        """Node of known light without its suns, prefiltered, vec3 [1, texel]."""
-        arguments = self._prefilter, light, self._separated(points, light)
-        return self._cached("prefiltered light", points, light, lambda: Node("prefiltering", *arguments))
+    def prefiltered(self, points: LitPoints, light: LightInput, *, with_suns: bool = False) -> Node:
+        """Node of known light, by default without its suns, prefiltered, vec3 [1, texel]."""
+        separated = self._separated(points, light)
+        name = "prefiltered light with suns" if with_suns and separated is not None else "prefiltered light"
+        arguments = self._prefilter, light, None if with_suns else separated
+        return self._cached(name, points, light, lambda: Node("prefiltering", *arguments))
 
     def _prefilter(self, light: KnownLight, separated: SeparatedLight | None) -> wp.array:
         radiance = light.radiance if separated is None else separated.rest

@@ -1,0 +1,109 @@
+"""Metals that lobes meet, against NumPy: a mirror and a wall that face each other, and receivers between them."""
+
+import numpy as np
+import twins
+import warp as wp
+
+from warpshadow.stages.gloss import lobe_hits, mirrored
+
+FLOAT32 = 3e-6  # rounding of unit vectors
+
+# A mirror in the plane x = 1, 2 wide, and a wall without gloss at x = −2, 3.2 wide; normals of the mirror lean.
+POSITIONS = np.array(
+    [[x, y * half, z * half] for x, half in ((1.0, 1.0), (-2.0, 1.6)) for y in (-1.0, 1.0) for z in (-1.0, 1.0)],
+    np.float32,
+)
+FACES = np.array([[0, 1, 2], [1, 3, 2], [4, 6, 5], [5, 6, 7]], np.int32)
+NORMALS = twins.unit(np.array([[-1, 0.2, 0.1], [-1, 0.1, 0], [-1, 0.3, 0.2], [-1, 0.2, -0.1], *[[1, 0, 0]] * 4]))
+POINTS = np.array([[0, 0, 0], [0.2, -0.3, 0.1]], np.float32)
+UP = np.array([[0, 1, 0]] * 2, np.float32)
+DIRECTIONS = twins.unit(
+    np.array([[[1, 0.2, 0.1], [-1, 0.1, 0], [0, 1, 0]], [[1, 0.5, 0.3], [1, 0.1, -0.5], [0.4, 0.02, 1]]])
+)
+
+
+def put(values, dtype, device):
+    return wp.array(np.asarray(values), dtype=dtype, device=device)
+
+
+def hits_of(device, transmittance=0.0):
+    mesh = wp.Mesh(put(POSITIONS, wp.vec3, device), put(FACES.ravel(), wp.int32, device))
+    arrays = [put(values, wp.vec3, device) for values in (NORMALS, POINTS, UP, DIRECTIONS)]
+    through = wp.full((2, 3), transmittance, dtype=wp.float32, device=device)
+    is_mirror, faces = put([1, 1, 0, 0], wp.int32, device), put(FACES, wp.vec3i, device)
+    return lobe_hits.trace_hits(mesh, is_mirror, faces, *arrays, through), faces
+
+
+def expected_hits():
+    """Whether samples meet the mirror, its normals there, and whether the mirrored rays pass the wall."""
+    distance = (1 - POINTS[:, None, 0]) / np.maximum(DIRECTIONS[..., 0], 1e-6)
+    y = POINTS[:, None] + distance[..., None] * DIRECTIONS
+    meets = (DIRECTIONS[..., 0] > 0) & (np.abs(y[..., 1:]) < 1).all(axis=-1)
+    u, v = (y[..., 1] + 1) / 2, (y[..., 2] + 1) / 2
+    low = (1 - v - u)[..., None] * NORMALS[0] + v[..., None] * NORMALS[1] + u[..., None] * NORMALS[2]
+    high = (1 - u)[..., None] * NORMALS[1] + (u + v - 1)[..., None] * NORMALS[3] + (1 - v)[..., None] * NORMALS[2]
+    normals = twins.unit(np.where((u + v < 1)[..., None], low, high))
+    towards = DIRECTIONS - 2 * (DIRECTIONS * normals).sum(axis=-1, keepdims=True) * normals
+    at_wall = y + ((-2 - y[..., :1]) / np.minimum(towards[..., :1], -1e-6)) * towards
+    is_open = (np.abs(at_wall[..., 1:]) > 1.6).any(axis=-1)
+    return meets, normals, is_open, towards
+
+
+def test_samples_meet_the_mirror_alone_and_see_what_its_normals_mirror(device):
+    hits, _ = hits_of(device)
+    meets, normals, is_open, _ = expected_hits()
+    np.testing.assert_array_equal(hits.face_ids.numpy() >= 0, meets)
+    assert meets.sum() == 3 and set(is_open[meets]) == {True, False}
+    np.testing.assert_allclose(hits.normals.numpy()[meets], normals[meets], atol=FLOAT32)
+    np.testing.assert_array_equal(hits.is_open.numpy()[meets], is_open[meets])
+
+
+def test_nothing_is_traced_towards_open_sky(device):
+    hits, _ = hits_of(device, transmittance=1.0)
+    assert (hits.face_ids.numpy() == -1).all()
+
+
+def mixed(device, hits, faces, *arrays):
+    """R of all samples, of a light that is the mirrored direction and its blur."""
+    roughness, directions, filters, albedo, metallic, mean = arrays
+    towards = mirrored.mirror(hits, faces, roughness, directions, filters)
+    return mirrored.mix_mirrored(hits, faces, albedo, metallic, towards.filters, towards.directions, mean), towards
+
+
+def inputs_of(device):
+    rng = np.random.default_rng(0)
+    values = [
+        (rng.uniform(0.2, 0.6, (1, 8)), wp.float32),
+        (DIRECTIONS[None], wp.vec3),
+        (rng.uniform(0.1, 0.3, (1, 2, 3, 3)), wp.vec3),
+        (rng.uniform(0.2, 0.9, (1, 8, 3)), wp.vec3),
+        (rng.uniform(0.3, 0.9, (1, 8)), wp.float32),
+        (rng.uniform(0.2, 0.9, (1, 2, 3)), wp.vec3),
+    ]
+    return [put(array, dtype, device) for array, dtype in values]
+
+
+def batched(hits):
+    return lobe_hits.LobeHits(*(array.reshape((1, *array.shape)) for array in hits))
+
+
+def test_metals_send_the_light_that_they_mirror_in_their_color(device):
+    hits, faces = hits_of(device)
+    arrays = inputs_of(device)
+    radiance, towards = mixed(device, batched(hits), faces, *arrays)
+    meets, normals, is_open, expected_towards = expected_hits()
+    roughness, _, filters, albedo, metallic, mean = (array.numpy()[0] for array in arrays)
+    weights, corners = hits.barycentrics.numpy()[meets], FACES[hits.face_ids.numpy()[meets]]
+    rough, color, share = (
+        np.einsum("hc,hc...->h...", weights, values[corners]) for values in (roughness, albedo, metallic)
+    )
+    grazing = (1 - np.abs((DIRECTIONS * normals).sum(axis=-1)[meets])) ** 5
+    blur = np.sqrt(filters[..., 2][meets] ** 2 + 2 * rough**4)
+    np.testing.assert_allclose(towards.filters.numpy()[0][meets], np.stack([grazing, 0 * blur, blur], 1), rtol=1e-4)
+    np.testing.assert_allclose(towards.directions.numpy()[0][meets], expected_towards[meets], atol=FLOAT32)
+    of_receivers = np.broadcast_to(mean[:, None], (2, 3, 3))
+    seen = np.where(is_open[meets][:, None], expected_towards[meets], of_receivers[meets])
+    fresnel = color + (1 - color) * grazing[:, None]
+    expected = of_receivers.copy()
+    expected[meets] += share[:, None] * (fresnel * seen - of_receivers[meets])
+    np.testing.assert_allclose(radiance.numpy()[0], expected, atol=10 * FLOAT32)

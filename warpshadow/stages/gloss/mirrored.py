@@ -1,0 +1,174 @@
+"""Mirrored bodies: a metal that a lobe meets reflects light once more, from where its own normal mirrors.
+
+A sample l of a lobe meets a body at a point with normal n, which mirrors l' = l − 2 (n·l) n. In place of the mean
+radiance R̄ of the receiver's blockers the point sends
+
+    R = R̄ + m (F (T' L + (1 − T') R̄) − R̄),   F = a + (1 − a) (1 − |n·l|)⁵,
+
+m how metallic it is, a its albedo, T' whether a ray along l' meets no body, and L light without shadows from l',
+blurred by σ'² = σ² + 2 α²: σ is the blur of the sample (:mod:`.lobes`), √2 α that of a whole lobe, seen from above.
+"""
+
+from typing import NamedTuple
+
+import warp as wp
+
+from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.launch import launch
+from warpshadow.device.parallel import split_row
+from warpshadow.stages.gloss.lobe_hits import LobeHits
+from warpshadow.stages.gloss.lobes import MIN_ROUGHNESS
+from warpshadow.stages.raster.interpolation import interpolate_at
+
+_COST = 20.0  # nanoseconds that a sample takes
+
+wp.set_module_options({"max_unroll": 1})
+
+
+@wp.kernel
+def _mirror(
+    first_row: int,
+    worker: int,
+    # in
+    face_ids: wp.array3d(dtype=wp.int32),
+    barycentrics: wp.array3d(dtype=wp.vec3),
+    hit_normals: wp.array3d(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    roughness: wp.array2d(dtype=wp.float32),
+    directions: wp.array3d(dtype=wp.vec3),
+    filters: wp.array3d(dtype=wp.vec3),
+    # out
+    mirrored: wp.array3d(dtype=wp.vec3),
+    mirrored_filters: wp.array3d(dtype=wp.vec3),
+):
+    """A thread owns a sample."""
+    row, sample = wp.tid()
+    batch, receiver = split_row(first_row + row, mirrored.shape[1])
+    direction = directions[instance_in(batch, directions.shape[0]), receiver, sample]
+    blur = filters[instance_in(batch, filters.shape[0]), receiver, sample][2]
+    grazing = float(0.0)
+    hit_batch = instance_in(batch, face_ids.shape[0])
+    face = face_ids[hit_batch, receiver, sample]
+    if face >= 0:
+        weights = barycentrics[hit_batch, receiver, sample]
+        normal = hit_normals[hit_batch, receiver, sample]
+        rough = interpolate_at(roughness[instance_in(batch, roughness.shape[0])], faces[face], weights)
+        width = wp.max(rough, MIN_ROUGHNESS)
+        width = width * width
+        blur = wp.sqrt(blur * blur + 2.0 * width * width)
+        cosine = wp.dot(normal, direction)
+        slant = 1.0 - wp.min(wp.abs(cosine), 1.0)
+        grazing = slant * slant * slant * slant * slant
+        direction = direction - 2.0 * cosine * normal
+    mirrored[batch, receiver, sample] = direction
+    mirrored_filters[batch, receiver, sample] = wp.vec3(grazing, 0.0, blur)
+
+
+class MirroredDirections(NamedTuple):
+    """Where bodies that lobes meet mirror light from; that of other samples is the sample itself."""
+
+    directions: wp.array  # l', vec3 of shape [batch, receiver, sample]
+    filters: wp.array  # (1 − |n·l|)⁵, 0 and σ' [radians], vec3 of the same shape
+
+
+def mirror(
+    hits: LobeHits, faces: wp.array, roughness: wp.array, directions: wp.array, filters: wp.array
+) -> MirroredDirections:
+    """Find the directions that the points mirror.
+
+    Args:
+        hits: Of :func:`.lobe_hits.trace_hits`, of all instances, [batch, receiver, sample].
+        faces: Vertices of the mesh, vec3i of shape [face].
+        roughness: Of the vertices, float32 of shape [batch, vertex].
+        directions, filters: Of :func:`.lobes.sample_lobes`. Any batch may be 1 and then serves every instance.
+
+    Differentiable: roughness, directions, filters. Not: hits, which stay where they are on their faces.
+    """
+    arrays = {"directions": directions, "filters": filters, "roughness": roughness, "hits": hits.face_ids}
+    shape = common_batch(arrays), *directions.shape[1:]
+    result = MirroredDirections(*(wp.empty(shape, dtype=wp.vec3, device=directions.device) for _ in range(2)))
+    of_hits = [hits.face_ids, hits.barycentrics, hits.normals]
+    launch(
+        _mirror,
+        (shape[0] * shape[1], shape[2]),
+        inputs=[*of_hits, faces, roughness, directions, filters],
+        outputs=[*result],
+        shared=[roughness, *(array for array in (directions, filters) if len(array) < shape[0])],
+        cost=_COST * shape[2],
+    )
+    return result
+
+
+@wp.kernel
+def _mix_mirrored(
+    first_row: int,
+    worker: int,
+    # in
+    face_ids: wp.array3d(dtype=wp.int32),
+    barycentrics: wp.array3d(dtype=wp.vec3),
+    is_open: wp.array3d(dtype=wp.float32),
+    faces: wp.array(dtype=wp.vec3i),
+    albedo: wp.array2d(dtype=wp.vec3),
+    metallic: wp.array2d(dtype=wp.float32),
+    filters: wp.array3d(dtype=wp.vec3),
+    light: wp.array3d(dtype=wp.vec3),
+    mean_radiance: wp.array2d(dtype=wp.vec3),
+    # out
+    radiance: wp.array3d(dtype=wp.vec3),
+):
+    """A thread owns a sample."""
+    row, sample = wp.tid()
+    batch, receiver = split_row(first_row + row, radiance.shape[1])
+    mean = mean_radiance[instance_in(batch, mean_radiance.shape[0]), receiver]
+    hit_batch = instance_in(batch, face_ids.shape[0])
+    face = face_ids[hit_batch, receiver, sample]
+    result = mean
+    if face >= 0:
+        weights = barycentrics[hit_batch, receiver, sample]
+        color = interpolate_at(albedo[instance_in(batch, albedo.shape[0])], faces[face], weights)
+        share = interpolate_at(metallic[instance_in(batch, metallic.shape[0])], faces[face], weights)
+        grazing = filters[instance_in(batch, filters.shape[0]), receiver, sample][0]
+        seen = mean
+        if is_open[hit_batch, receiver, sample] > 0.5:
+            seen = light[instance_in(batch, light.shape[0]), receiver, sample]
+        fresnel = color + grazing * (wp.vec3(1.0) - color)
+        result = mean + share * (wp.cw_mul(fresnel, seen) - mean)
+    radiance[batch, receiver, sample] = result
+
+
+def mix_mirrored(
+    hits: LobeHits,
+    faces: wp.array,
+    albedo: wp.array,
+    metallic: wp.array,
+    filters: wp.array,
+    light: wp.array,
+    mean_radiance: wp.array,
+) -> wp.array:
+    """Mix the radiance R of the blockers of each sample.
+
+    Args:
+        hits, faces: As of :func:`mirror`.
+        albedo, metallic: Of the vertices, vec3 and float32 of shape [batch, vertex].
+        filters: Of :func:`mirror`.
+        light: L, vec3 of shape [batch, receiver, sample].
+        mean_radiance: R̄, of :func:`.reflection.find_blocked_radiance`, vec3 of shape [batch, receiver].
+            Any batch may be 1 and then serves every instance.
+
+    Returns:
+        Vec3 of shape [batch, receiver, sample].
+
+    Differentiable: all but hits.
+    """
+    values = {"albedo": albedo, "metallic": metallic, "filters": filters, "light": light, "blocked": mean_radiance}
+    shape = common_batch({"hits": hits.face_ids, **values}), *light.shape[1:]
+    radiance = wp.empty(shape, dtype=wp.vec3, device=light.device)
+    launch(
+        _mix_mirrored,
+        (shape[0] * shape[1], shape[2]),
+        inputs=[hits.face_ids, hits.barycentrics, hits.is_open, faces, *values.values()],
+        outputs=[radiance],
+        shared=[albedo, metallic, *(array for array in (filters, light, mean_radiance) if len(array) < shape[0])],
+        cost=_COST * shape[2],
+    )
+    return radiance
