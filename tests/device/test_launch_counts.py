@@ -16,9 +16,9 @@ from warpshadow.tuning.timing import whole_image
 # Four find the footprints of receivers, for the image and for probes of squares, and how large light sees them.
 MOST = {
     "image": (44, 8),
-    "pose iteration": (67, 5),
+    "pose iteration": (67, 6),
     "image with two bounces": (89, 11),
-    "pose iteration with two bounces": (156, 13),
+    "pose iteration with two bounces": (156, 14),
 }
 MOST_OF_A_BOX = 39  # kernels that a box more takes where light bounces twice, for its receivers and its patch samples
 
