@@ -19,6 +19,10 @@ SMOOTH = 1e-2
 # Silhouettes are sampled by pixels, whose colors stand for those at the edge.
 SILHOUETTE = 5e-2
 
+# Of a textured ball, whose own outline is in view, on average over places. Measured 1.4 and 0.9% at 1 and 2² samples a
+# pixel, and 11.3 and 9.0% where albedo moves with the points of all samples.
+TEXTURED = 3e-2
+
 # Gradients are summed up in slices, whose number follows the size of the launch.
 SUMS = {"rtol": 1e-4, "atol": 1e-4}
 
@@ -186,6 +190,39 @@ def test_a_limb_pulls_by_the_color_it_has_at_its_edge(monkeypatch):
     monkeypatch.setattr(view_module, "moving_radiance", lambda *inputs: (film.sample_radiance(*inputs[:4]), None))
     beside, _ = gradient_and_differences(image_of, shifts, 1e-2, slice(3))
     assert relative_error(beside, expected) > 2 * relative_error(got, expected)
+
+
+@pytest.mark.parametrize("supersampling", [1, 2])
+def test_the_outline_of_a_textured_ball_has_on_average_the_gradient_of_the_image(supersampling):
+    """Along paths of two pixels from random places, across a plain background."""
+    mesh, size, generator = ws.icosphere(0.5, 3), 48, torch.Generator().manual_seed(0)
+    row, column = 2 * np.pi * np.mgrid[0:1:64j, 0:1:64j]
+    waves = 0.5 + 0.4 * np.sin(6 * column + 2 * row) * np.sin(4 * row - 2 * column)
+    across = mesh.positions @ [[0.35, 0.1], [-0.1, 0.7], [0.2, -0.25]]  # no seam is in view
+    textured = ws.Mesh(mesh.positions, mesh.faces, across + 0.3)
+    ball = ws.Body(textured, texture=np.repeat(waves[..., None], 3, axis=2).astype(np.float32), blockers=0)
+    camera = ws.Camera.look_at((0.3, 0.9, 2.6), (0, 0, 0), fov_y=32, size=(size, size))
+    light = ws.EnvironmentMap(np.ones((8, 16, 3)))
+    scene = ws.Scene([ball], light, camera, ws.Visibility("none"), supersampling=supersampling)
+    renderer, image_weights = TorchRenderer(scene, progress=False), smooth_weights(size, size)[..., :3].float()
+    rotations, translations, scales = renderer.scene_poses()
+
+    def losses(shifts):
+        images = renderer(geometry=renderer.placed(rotations, translations + shifts[:, None], scales))
+        return torch.einsum("hwc,bhwc->bc", image_weights, images[..., :3])
+
+    pixel, count = 2 * np.tan(np.radians(16)) * 2.75 / size, 64
+    gradients, slopes = [], []
+    for axis in torch.eye(3)[:2]:
+        starts = pixel * torch.rand(count, 3, generator=generator)
+        shares = (torch.arange(count) % 8 + torch.rand(count, generator=generator)) / 8
+        shifts = (starts + 2 * pixel * shares[:, None] * axis).requires_grad_(True)
+        sums = losses(shifts).sum(0)
+        means = [torch.autograd.grad(value, shifts, retain_graph=True)[0].mean(0) @ axis for value in sums]
+        gradients.append(torch.stack(means))
+        with torch.no_grad():
+            slopes.append((losses(starts + 2 * pixel * axis) - losses(starts)).mean(0) / (2 * pixel))
+    assert relative_error(torch.stack(gradients).numpy(), torch.stack(slopes).numpy()) < TEXTURED
 
 
 # ---------------------------------------------------------------------------------------------- batches

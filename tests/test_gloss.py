@@ -31,6 +31,9 @@ OUTLINES = 0.12
 # pixel as it lies in the plane of its face.
 SUN = 0.06
 
+# Of a highlight that is a sample off a limb. Measured 18%, and 52% with mean slopes up to one sample from outlines.
+LIMB = 0.3
+
 SKY = ws.synthetic_sky((-0.7, 0.5, 0.2), sun_radius=12, sun_strength=3, height=32)
 BALL = ws.Body(
     ws.icosphere(1.0, 3),
@@ -277,12 +280,13 @@ def test_gradients_along_a_path_are_the_change_of_the_image_although_a_sun_shine
     assert error < SUN
 
 
-def test_gradients_along_the_limb_of_a_metal_that_hides_the_sun_are_on_average_the_slopes_of_the_image():
-    """The highlight is about a sample wide, and a sample off the limb, above the middle: it moves to the right."""
+def test_gradients_at_the_limb_of_a_metal_that_hides_the_sun_are_on_average_the_slopes_of_the_image():
+    """The highlight is about a sample wide, and a sample off the limb, above the middle: it moves along and across."""
     ball = ws.Body(ws.icosphere(0.4, 4), albedo=(0.9, 0.7, 0.3), roughness=0.3, metallic=1.0)
     sun = ws.synthetic_sky((0.2, 0.5, -1), sun_radius=2, sun_strength=3, height=64)
     size, half_width = 48, 0.03  # of the square in which the ball is moved: three pixels of 0.02
-    scene = ws.Scene([ball], sun, ws.Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=18, size=(size, size)))
+    camera = ws.Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=18, size=(size, size))
+    scene = ws.Scene([ball], sun, camera, supersampling=1)
     renderer, rng = TorchRenderer(scene, progress=False), np.random.default_rng(0)
     rotations, translations, scales = renderer.scene_poses()
     rows, columns = torch.meshgrid(torch.linspace(-1, 1, size), torch.linspace(-1, 1, size), indexing="ij")
@@ -293,13 +297,18 @@ def test_gradients_along_the_limb_of_a_metal_that_hides_the_sun_are_on_average_t
         images = renderer(geometry=renderer.placed(rotations, translations + shifts, scales))
         return (images[..., :3] * image_weights).sum((1, 2, 3))
 
-    places = torch.tensor(rng.uniform(-half_width, half_width, (24, 2)), dtype=torch.float32, requires_grad=True)
-    gradient = torch.autograd.grad(losses(places).sum(), places)[0].mean(0)
-    ends = places.detach().repeat(2, 1)
-    ends[:24, 0], ends[24:, 0] = half_width, -half_width
-    right, left = losses(ends).reshape(2, 24).mean(1)
-    slope = (right - left) / (2 * half_width)
-    assert abs(gradient[0] - slope) < 0.25 * abs(slope), (gradient, slope)
+    squares = np.mgrid[0:12, 0:12].reshape(2, -1).T  # each with a place
+    places = torch.tensor(half_width * ((squares + rng.uniform(size=squares.shape)) / 6 - 1), dtype=torch.float32)
+    gradient, slope = torch.zeros(2), torch.zeros(2)
+    for some in places.split(24):
+        some.requires_grad_(True)
+        gradient += torch.autograd.grad(losses(some).sum(), some)[0].sum(0) / len(places)
+        for axis in range(2):
+            ends = some.detach().repeat(2, 1)
+            ends[: len(some), axis], ends[len(some) :, axis] = half_width, -half_width
+            above, below = losses(ends).reshape(2, -1).sum(1) / len(places)
+            slope[axis] += (above - below) / (2 * half_width)
+    assert torch.linalg.norm(gradient - slope) < LIMB * torch.linalg.norm(slope), (gradient, slope)
 
 
 @pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render()])

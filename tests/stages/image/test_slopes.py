@@ -4,11 +4,19 @@ import numpy as np
 import pytest
 import warp as wp
 from meshes import through_plane
+from scipy import ndimage
 
 import warpshadow as ws
 from warpshadow.maths.adjacency import edge_neighbors
 from warpshadow.stages.image.film import sample_radiance
-from warpshadow.stages.image.slopes import MIN_DISTANCE, MIN_WEIGHT, moving_radiance
+from warpshadow.stages.image.slopes import (
+    MIN_DISTANCE,
+    MIN_WEIGHT,
+    REACH,
+    find_mean_slopes,
+    hold_fragments,
+    moving_radiance,
+)
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.rasterization import rasterize
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
@@ -49,11 +57,14 @@ class Drawn:
     def edge_colors(self, samples):
         return find_edge_colors(samples, self.silhouettes, self.clip, self.shading, self.receivers, self.albedo)
 
-    def pulls(self, seeds):
+    def mean_slopes(self):
+        return find_mean_slopes(self.silhouettes, self.clip)
+
+    def pulls(self, seeds, *masks):
         """Gradient to the clip positions by mean slopes."""
         with wp.Tape() as tape:
             seen = self.fragments, self.faces, self.shading, self.albedo
-            samples, edge_colors = moving_radiance(*seen, self.silhouettes, self.clip, self.receivers)
+            samples, edge_colors = moving_radiance(*seen, self.silhouettes, self.clip, self.receivers, *masks)
         np.testing.assert_array_equal(samples.numpy(), self.samples().numpy())
         np.testing.assert_array_equal(edge_colors.numpy(), self.edge_colors(samples).numpy())
         return self._played(tape, samples, seeds)
@@ -91,7 +102,7 @@ def image_weight(drawn, sample):
     return max(total, MIN_WEIGHT)
 
 
-def twin(drawn):
+def twin(drawn, is_albedo_moving=None):
     """The same in float64, from what was found: a sum over samples of −slope · motion on screen."""
     width, height = CAMERA.width, CAMERA.height
     clip, faces = drawn.clip.numpy()[0].astype(float), drawn.faces.numpy()
@@ -101,6 +112,7 @@ def twin(drawn):
     edge_colors = drawn.edge_colors(samples).numpy()[..., :3].astype(float)
     albedo = drawn.albedo.numpy().reshape(-1, 3).astype(float)
     pulls = np.zeros_like(clip)
+    is_albedo_moving = np.zeros(len(face_ids), bool) if is_albedo_moving is None else is_albedo_moving
     for batch, (color, shading) in enumerate(zip(samples.numpy(), drawn.shading.numpy(), strict=True)):
         color, seeds = color.reshape(-1, 4)[:, :3].astype(float), drawn.seeds[batch].reshape(-1, 4)[:, :3]
         received = np.einsum("pk,pkc->pc", weights, shading[faces[face_ids]])
@@ -108,7 +120,7 @@ def twin(drawn):
             column, row = sample % width, sample // width
             here, corners = np.array([column + 0.5, row + 0.5]), clip[faces[face_ids[sample]]]
             slope = np.zeros((2, 3))
-            around, edge_steps, extents = [], [], np.ones(2)
+            around, edge_steps, extents = [not is_albedo_moving[sample]], [], np.ones(2)
             for axis in range(2):
                 rises, spans = np.zeros(3), 0.0
                 for sign in (1, -1):
@@ -133,6 +145,8 @@ def twin(drawn):
                             extents[axis] += t - 0.5
                     elif edge[0] == -1 and face_ids[other] >= 0:
                         rises += sign * 0.5 * albedo[sample] * (received[other] - received[sample])
+                        if is_albedo_moving[sample]:
+                            rises += sign * 0.5 * received[other] * (albedo[other] - albedo[sample])
                         spans += 0.5
                 slope[axis] = rises / spans if spans else np.nan
                 edge_steps = [(k, edge, step / spans if k == axis else step) for k, edge, step in edge_steps]
@@ -167,6 +181,34 @@ def test_surfaces_pull_by_mean_slopes(device, lights):
     drawn = Drawn(positions, faces, bodies, device, lights=lights)
     got, expected = drawn.pulls(drawn.seeds), twin(drawn)
     assert np.abs(got - expected).max() < FLOAT32 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("lights", [1, 2])
+def test_near_outlines_surfaces_pull_by_mean_slopes_of_albedo_too(device, lights):
+    positions, faces, bodies = through_plane(ws.icosphere(0.8, 2))
+    drawn = Drawn(positions, faces, bodies, device, lights=lights)
+    mask = drawn.mean_slopes()
+    assert 20 < mask.numpy().sum() < 0.5 * mask.size
+    got, expected = drawn.pulls(drawn.seeds, None, mask), twin(drawn, mask.numpy()[0])
+    assert np.abs(got - expected).max() < FLOAT32 * np.abs(expected).max()
+    assert np.abs(got - twin(drawn)).max() > 0.01 * np.abs(expected).max()
+
+
+def test_samples_up_to_two_from_an_outline_have_mean_slopes_and_hold_their_points(device):
+    ball = ws.icosphere(1.2, 3)
+    drawn = Drawn(ball.positions, ball.faces, np.zeros(ball.face_count), device)
+    on_ball = drawn.fragments.face_ids.numpy()[0] >= 0
+    expected = on_ball & ndimage.binary_dilation(~on_ball, iterations=REACH + 1)
+    mask = drawn.mean_slopes()
+    np.testing.assert_array_equal(mask.numpy().reshape(on_ball.shape), expected)
+    drawn.fragments.barycentrics.grad.zero_()
+    with wp.Tape() as tape:
+        held = hold_fragments(drawn.fragments, mask).barycentrics
+    np.testing.assert_array_equal(held.numpy(), drawn.fragments.barycentrics.numpy())
+    seeds = wp.array(drawn.seeds[..., :3], dtype=wp.vec3, device=device)
+    tape.backward(grads={held: seeds})
+    handed_on = drawn.fragments.barycentrics.grad.numpy()[0]
+    np.testing.assert_array_equal(handed_on, np.where(expected[..., None], 0, drawn.seeds[0, ..., :3]))
 
 
 def test_a_face_that_all_neighbors_see_pulls_by_its_own_slope(device):

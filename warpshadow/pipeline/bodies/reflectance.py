@@ -144,6 +144,12 @@ class Materials:
             arrays["emission"] = [array(np.atleast_2d(colors)) for colors in emission]
         return cls(merged_scene, {name: Input(name, values) for name, values in arrays.items()})
 
+    @property
+    def have_patterns(self) -> bool:
+        """Whether a body has several colors: of its vertices, or of a texture."""
+        sources = (self._inputs[name].value() for name in ("albedo", "textures", "emission") if name in self._inputs)
+        return any(array.shape[1:] != (1,) for arrays in sources for array in arrays if array is not None)
+
     def is_black(self, number: int) -> bool:
         """Whether a body is known to reflect nothing: it is black in the scene, and nothing is given in place of it."""
         for name in ("albedo", "textures"):

@@ -17,7 +17,7 @@ from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.receiver_finder import ReceiverFinder
 from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.image.film import average, sample_radiance, sum_radiance
-from warpshadow.stages.image.slopes import moving_radiance
+from warpshadow.stages.image.slopes import find_mean_slopes, hold_fragments, moving_radiance
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.rasterization import Fragments, rasterize
@@ -141,7 +141,7 @@ class View(LitPoints):
     def image(self, light: LightInput, materials: Materials) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
         item_text, clip, fragments = self._sample_text, self.clip_positions, self.fragments_node
-        shading, reflectance = self.shading(light, materials), self.reflectance(materials)
+        shading, reflectance = self.shading(light, materials), self._moving_reflectance(materials)
         shines = materials.roughness or materials.emission
         if not shines and reflectance.pyramids.requires_grad and not (shading.requires_grad or clip.requires_grad):
             replaced_stages = (NodeStage("reflectance", idle="found with the radiance"),)
@@ -156,24 +156,47 @@ class View(LitPoints):
 
     def reflectance(self, materials: Materials) -> SampleReflectance:
         """Nodes of the samples' reflectance; the scene's own are cached."""
-        wire = functools.partial(self._find_reflectance, materials)
-        return self.cached("reflectance", None, wire) if materials is self.materials else wire()
+        return self._reflectance_of(materials, self.fragments_node)
 
-    def _find_reflectance(self, materials: Materials) -> SampleReflectance:
+    def _moving_reflectance(self, materials: Materials) -> SampleReflectance:
+        """The same for :meth:`_radiance`."""
+        return self._reflectance_of(materials, self._patterned(materials)[0])
+
+    def _reflectance_of(self, materials: Materials, fragments: Node) -> SampleReflectance:
+        wire = functools.partial(self._find_reflectance, materials, fragments)
+        return self.cached("reflectance", fragments, wire) if materials is self.materials else wire()
+
+    def _patterned(self, materials: Materials) -> tuple[Node, Node | None]:
+        """Nodes of the fragments by which colors move, and of the samples whose colors have mean slopes instead.
+
+        None have them, and the latter is None, where nothing moves or each body has one color.
+        """
+        if not (self._is_moving and materials.have_patterns):
+            return self.fragments_node, None
+
+        def wire() -> tuple[Node, Node]:
+            seen = detached(self.silhouettes), detached(self.clip_positions)
+            slopes = Node("", find_mean_slopes, *seen)
+            return Node("", hold_fragments, self.fragments_node, slopes), slopes
+
+        return self.cached("mean slopes", None, wire)
+
+    def _find_reflectance(self, materials: Materials, fragments: Node) -> SampleReflectance:
         textures = materials.textures_of["textures"]
         if not textures.images:
-            return materials.untextured_reflectance(self.fragments_node, self._sample_text)
+            return materials.untextured_reflectance(fragments, self._sample_text)
         pyramids = textures.pyramids
         if materials.textures is not self.materials.textures:
             pyramids = textures.pyramids_to(functools.partial(self.coarsest_level, textures.sizes))
-        arguments = self.fragments_node, self.clip_positions, pyramids, self._sample_text
-        footprints = self.cached("footprints", textures.sizes, functools.partial(textures.footprints, *arguments))
-        return materials.reflectance(self.fragments_node, pyramids, footprints, self._sample_text)
+        arguments = fragments, self.clip_positions, pyramids, self._sample_text
+        key, wire = (textures.sizes, fragments), functools.partial(textures.footprints, *arguments)
+        footprints = self.cached("footprints", key, wire)
+        return materials.reflectance(fragments, pyramids, footprints, self._sample_text)
 
     def coarsest_level(self, sizes: tuple) -> int | None:
         """Coarsest level that cached footprints in textures of some sizes take; on a GPU it waits for that, once."""
-        known, footprints = self._cached.get("footprints", (None, None))
-        if known != sizes or not footprints.is_cached:
+        known, footprints = self._cached.get("footprints", ((None, None), None))
+        if known[0] != sizes or not footprints.is_cached:
             return None
         level = self.cached("coarsest", footprints, lambda: Node("", Footprints.coarsest_level, footprints))
         return None if self.merged_scene.device.is_capturing and not level.is_cached else level.value(self.call)
@@ -192,21 +215,22 @@ class View(LitPoints):
         if materials.roughness:
             reflected = self._glossy(shading, light, materials, reflectance)
         else:
-            reflected = self._radiance(shading, reflectance)
+            reflected = self._radiance(shading, reflectance, materials)
         if not materials.emission:
             return reflected
-        emitted = self._radiance(Node("", _white_shading, self.receivers_node), self._emission(materials))
+        emission = self._emission(materials, self._patterned(materials)[0])
+        emitted = self._radiance(Node("", _white_shading, self.receivers_node), emission, materials)
         return self._sum_of(reflected, emitted)
 
-    def _emission(self, materials: Materials) -> Node:
+    def _emission(self, materials: Materials, fragments: Node) -> Node:
         """Node of the radiance that the samples emit, vec3 of shape [batch, height, width]."""
         textures = materials.textures_of["emission"]
-        seen = self.fragments_node, self.merged_scene.faces, materials.of_vertices("emission")
+        seen = fragments, self.merged_scene.faces, materials.of_vertices("emission")
         if not textures.images:
             return self._within_beams(Node("emission", interpolate, *seen))
-        arguments = self.fragments_node, self.clip_positions, textures.pyramids, ""
+        arguments = fragments, self.clip_positions, textures.pyramids, ""
         wire = functools.partial(textures.footprints, *arguments)
-        footprints = self.cached("footprints in emission", textures.sizes, wire)
+        footprints = self.cached("footprints in emission", (textures.sizes, fragments), wire)
         return self._within_beams(Node("emission", sample_albedo, *seen, textures.pyramids, footprints))
 
     def _within_beams(self, emission: Node) -> Node:
@@ -232,7 +256,8 @@ class View(LitPoints):
         lobes = LitLobes(points, light, self)
         blocked = self.transport.blocked_radiance(lobes, materials)
         colored, white = mix_gloss(self.method, lobes, shading, materials, blocked)
-        return self._sum_of(self._radiance(colored, reflectance), self._radiance(white, self._white_reflectance))
+        reflected = self._radiance(colored, reflectance, materials)
+        return self._sum_of(reflected, self._radiance(white, self._white_reflectance))
 
     @property
     def _is_moving(self) -> bool:
@@ -258,7 +283,7 @@ class View(LitPoints):
         """
         from warpshadow.stages.image.photograph import compose, composite_alone, find_ratio_image
 
-        shading, reflectance = self.shading(light, materials), self.reflectance(materials)
+        shading, reflectance = self.shading(light, materials), self._moving_reflectance(materials)
 
         def divide(fragments: Fragments, *arguments: wp.array) -> "RatioImage":
             return find_ratio_image(fragments.face_ids, catches, *arguments)
@@ -293,11 +318,12 @@ class View(LitPoints):
         """The view with the receivers of another view by the same cameras, among this view's blockers."""
         return other.cached("in another scene", self, lambda: self.with_receivers(other.receivers_node))
 
-    def _radiance(self, shading: Node, reflectance: Node) -> Node:
-        """Node of the samples."""
+    def _radiance(self, shading: Node, reflectance: Node, materials: Materials | None = None) -> Node:
+        """Node of the samples; given materials, the reflectance is that of surfaces, with which it moves."""
         make_node = functools.partial(Node, "radiance", items=self._sample_text, caches=False)
         if self._is_moving:
-            moving = self.silhouettes, self.clip_positions
+            slopes = None if materials is None else self._patterned(materials)[1]
+            moving = self.silhouettes, self.clip_positions, slopes
             return make_node(_moving_radiance, self.receivers_node, shading, reflectance, *moving)
         return make_node(_radiance, self.receivers_node, shading, reflectance)
 
@@ -363,11 +389,16 @@ def _radiance(receivers: Receivers, shading: wp.array, reflectance: wp.array) ->
 
 
 def _moving_radiance(
-    receivers: Receivers, shading: wp.array, reflectance: wp.array, silhouettes: Silhouettes, clip_positions: wp.array
+    receivers: Receivers,
+    shading: wp.array,
+    reflectance: wp.array,
+    silhouettes: Silhouettes,
+    clip_positions: wp.array,
+    albedo_has_mean_slope: wp.array | None,
 ) -> tuple[wp.array, wp.array]:
     """Samples, and the colors at edges."""
     arguments = receivers.fragments, receivers.faces, shading, reflectance, silhouettes, clip_positions
-    return moving_radiance(*arguments, receivers.receiver_of_vertex, receivers.has_mean_slope)
+    return moving_radiance(*arguments, receivers.receiver_of_vertex, receivers.has_mean_slope, albedo_has_mean_slope)
 
 
 def _sum_moving(first: tuple[wp.array, wp.array], second: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:

@@ -18,10 +18,14 @@ a ball of metal of roughness 0.2 before a sun has a gradient of −3500 where th
 Where another surface comes in front before the neighbor's center, or the image ends, the opposite half counts alone.
 Where all neighbors see the same face, the slope is the face's own.
 
-A sample that is a receiver itself has the exact derivative at its point instead, except beside the outline of its
+A sample that is a receiver itself has the exact derivative at its point instead, except near the outline of its
 surface. There the exact slope is often tiny and rarely huge, as it grows without bound towards a limb, and does not
 match the colors at the edges: gradients of a mirroring ball are half of the differences of images. With mean slopes of
-the samples along an outline, and of their neighbors, the colors of edges cancel.
+the samples along an outline, and of those up to two steps away, the colors of edges cancel. (One is too few for the
+highlight of a sun, which may be three samples wide: across the outline gradients had the wrong sign.)
+
+The albedo of vertices or a texture has the exact derivative, too, which keeps its detail, and likewise mean slopes near
+outlines: c is a product, light times albedo, of which either factor moves or both do.
 """
 
 import math
@@ -30,8 +34,8 @@ from dataclasses import replace
 import warp as wp
 
 from warpshadow.device.batch import instance_in, rows
-from warpshadow.device.launch import launch, without_gradient
-from warpshadow.device.memory import empty, reshaped
+from warpshadow.device.launch import differentiable, launch, without_gradient
+from warpshadow.device.memory import copied, reshaped, zeros
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import record_adjoint
 from warpshadow.stages.image.film import sample_radiance
@@ -65,7 +69,9 @@ MIN_DISTANCE = 0.02  # distance of an edge [samples] below which rounding outwei
 
 MIN_WEIGHT = 0.25  # of a sample in the smoothed image, by which its slopes are divided
 
-_COST, _MEAN_SLOPE_COST = 20.0, 4.0  # nanoseconds of a sample: its gradient, and the search for its mean slope
+REACH = 2  # steps from outlines up to which samples have mean slopes: farther in these would lose detail of textures
+
+_COST = 20.0  # nanoseconds that the gradient of a sample takes
 
 
 @wp.func
@@ -110,49 +116,67 @@ def _distance_to_end(
 
 
 @wp.func
-def _is_near_silhouette(fragments: FragmentArrays, entries: wp.array(dtype=wp.int32), sample: int):
-    """Whether a sample or a neighbor has an entry among the silhouettes."""
-    width = fragments.width
-    last = entries.shape[0] - 1
-    entry_in_row = wp.max(entries[wp.max(sample - 1, 0)], entries[wp.min(sample + 1, last)])
-    entry_in_column = wp.max(entries[wp.max(sample - width, 0)], entries[wp.min(sample + width, last)])
-    return wp.max(entries[sample], wp.max(entry_in_row, entry_in_column)) >= 0
-
-
-@wp.kernel(enable_backward=False)
-def _find_mean_slopes(
-    first_row: int,
-    worker: int,
-    # in
+def _let_follow(
     fragments: FragmentArrays,
     entries: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
     sides: wp.array(dtype=wp.int32),
     keys: wp.array(dtype=wp.int32),
+    has_mean_slope: wp.array(dtype=wp.bool),
+    sample: int,
+):
+    """Let a sample have a mean slope if slopes along both axes are known, and it is in no square."""
+    if not has_mean_slope[sample]:
+        is_known = bool(True)
+        if keys:
+            is_known = keys[sides[sample]] < 0
+        for axis in range(2):
+            forward = _distance_to_end(fragments, entries, edges, sample, 2 * axis)
+            backward = _distance_to_end(fragments, entries, edges, sample, 2 * axis + 1)
+            is_known = is_known and wp.max(forward, backward) > -2.0
+        if is_known:
+            has_mean_slope[sample] = True
+
+
+@wp.kernel(enable_backward=False)
+def _find_mean_slopes(
+    # in
+    samples: wp.array(dtype=wp.int32),
+    fragments: FragmentArrays,
+    entries: wp.array(dtype=wp.int32),
+    edges: wp.array2d(dtype=wp.vec2i),
+    sides: wp.array(dtype=wp.int32),
+    keys: wp.array(dtype=wp.int32),
+    reach: int,
     # out
     has_mean_slope: wp.array(dtype=wp.bool),
 ):
-    """A thread owns a sample: whether its surface ends beside it, or beside a neighbor, and both slopes are known."""
-    sample = first_row + wp.tid()
-    side = sides[sample]
+    """A thread owns an entry: if its surface ends there, that and samples up to ``reach`` steps away on the surface.
+
+    All are False before. Threads that write to the same place write the same.
+    """
+    sample = samples[wp.tid()]
     is_at_outline = bool(False)
-    has_slopes = side >= 0 and _is_near_silhouette(fragments, entries, sample)  # nearly all samples end here
-    if keys and has_slopes:
-        has_slopes = keys[side] < 0
-    if has_slopes:
-        for axis in range(2):
-            is_known = bool(False)
-            for k in range(2 * axis, 2 * axis + 2):
-                distance = _distance_to_end(fragments, entries, edges, sample, k)
-                is_known = is_known or distance > -2.0
-                is_at_outline = is_at_outline or distance > 0.0
-                if distance == -1.0:
-                    neighbor_sample = neighbor(sample, k, fragments.width)
-                    for j in range(4):
-                        neighbor_distance = _distance_to_end(fragments, entries, edges, neighbor_sample, j)
-                        is_at_outline = is_at_outline or neighbor_distance > 0.0
-            has_slopes = has_slopes and is_known
-    has_mean_slope[sample] = has_slopes and is_at_outline
+    if sample >= 0:
+        for k in range(4):
+            is_at_outline = is_at_outline or _distance_to_end(fragments, entries, edges, sample, k) > 0.0
+    if is_at_outline:
+        _let_follow(fragments, entries, edges, sides, keys, has_mean_slope, sample)
+        for k in range(4):
+            on_path = sample
+            steps = int(0)
+            while steps < reach and _distance_to_end(fragments, entries, edges, on_path, k) == -1.0:
+                on_path = neighbor(on_path, k, fragments.width)
+                steps += 1
+                _let_follow(fragments, entries, edges, sides, keys, has_mean_slope, on_path)
+                for turn in range(2):
+                    direction = wp.where(k < 2, 2, 0) + turn
+                    end = on_path
+                    further_steps = steps
+                    while further_steps < reach and _distance_to_end(fragments, entries, edges, end, direction) == -1.0:
+                        end = neighbor(end, direction, fragments.width)
+                        further_steps += 1
+                        _let_follow(fragments, entries, edges, sides, keys, has_mean_slope, end)
 
 
 def find_mean_slopes(silhouettes: Silhouettes, clip_positions: wp.array, quadtree: Quadtree | None = None) -> wp.array:
@@ -169,14 +193,49 @@ def find_mean_slopes(silhouettes: Silhouettes, clip_positions: wp.array, quadtre
     """
     fragments = silhouettes.fragments
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
-    has_mean_slope = empty(rows(sides).shape, dtype=wp.bool, device=sides.device)
+    has_mean_slope = zeros(rows(sides).shape, dtype=wp.bool, device=sides.device)
     arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
     keys = None if quadtree is None else quadtree.square_key_of_side
-    inputs = [arrays, silhouettes.entries, silhouettes.edges, reshaped(sides, (-1,)), keys]
-    launch(
-        _find_mean_slopes, sides.size, inputs=inputs, outputs=[reshaped(has_mean_slope, (-1,))], cost=_MEAN_SLOPE_COST
-    )
+    inputs = [silhouettes.samples, arrays, silhouettes.entries, silhouettes.edges, reshaped(sides, (-1,)), keys, REACH]
+    launch(_find_mean_slopes, silhouettes.samples.size, inputs=inputs, outputs=[reshaped(has_mean_slope, (-1,))])
     return has_mean_slope
+
+
+@wp.kernel(enable_backward=False)
+def _add_gradients_of_points(
+    # in
+    has_mean_slope: wp.array2d(dtype=wp.bool),
+    adj_held: wp.array2d(dtype=wp.vec3),
+    # out
+    adj_barycentrics: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a sample."""
+    view, sample = wp.tid()
+    if not has_mean_slope[view, sample]:
+        adj_barycentrics[view, sample] += adj_held[view, sample]
+
+
+def hold_fragments(fragments: Fragments, has_mean_slope: wp.array) -> Fragments:
+    """Fragments by which a color moves with its point, but at samples where its mean slope tells how it moves.
+
+    Args:
+        has_mean_slope: Of :func:`find_mean_slopes`.
+
+    Differentiable: barycentrics of the other samples.
+    """
+    barycentrics = fragments.barycentrics
+    held_barycentrics = differentiable(
+        lambda _: None,
+        lambda adj_held: launch(
+            _add_gradients_of_points,
+            has_mean_slope.shape,
+            inputs=[has_mean_slope, rows(adj_held)],
+            outputs=[rows(barycentrics.grad)],
+        ),
+        copied(barycentrics),
+        [barycentrics],
+    )
+    return replace(fragments, barycentrics=held_barycentrics)
 
 
 @wp.kernel(enable_backward=False)
@@ -196,6 +255,7 @@ def _add_shading_gradients(
     shares: wp.array2d(dtype=wp.vec3),
     edge_colors: wp.array3d(dtype=wp.vec4),
     has_mean_slope: wp.array2d(dtype=wp.bool),
+    albedo_has_mean_slope: wp.array2d(dtype=wp.bool),
     first_sample_face: int,
     run: int,
     adj_samples: wp.array2d(dtype=wp.vec4),
@@ -224,14 +284,17 @@ def _add_shading_gradients(
             is_moving = not is_receiver
             if has_mean_slope:
                 is_moving = is_moving or has_mean_slope[fragment_batch, sample]
+            is_albedo_moving = bool(False)
+            if albedo_has_mean_slope:
+                is_albedo_moving = albedo_has_mean_slope[fragment_batch, sample]
             # A sample that is a receiver has the gradient of the receiver's point instead.
-            if face >= 0 and is_moving and wp.length_sq(adj_color) > 0.0:
+            if face >= 0 and (is_moving or is_albedo_moving) and wp.length_sq(adj_color) > 0.0:
                 adj_light = wp.cw_mul(adj_color, albedo[albedo_batch, sample])
                 sample_light = light[light_batch, sample]
                 color = samples[batch, sample]
                 center = sample_center(fragment, width, fragments.height)
                 entry = entries[fragment]
-                is_flat = entry < 0 and not is_receiver
+                is_flat = entry < 0 and not is_receiver and not is_albedo_moving
                 for direction in range(4):
                     if has_neighbor(fragment, direction, width, fragments.height):
                         is_flat = is_flat and fragments.face_ids[neighbor(fragment, direction, width)] == face
@@ -254,16 +317,22 @@ def _add_shading_gradients(
                             if ends_before(line, direction) and t > MIN_DISTANCE and t <= 1.0:
                                 # entries are of all views; where one view serves all images, each has its
                                 # own colors
-                                color_step = edge_colors[batch - fragment_batch, entry, direction] - color
-                                adj_step = wp.dot(adj_color, wp.vec3(color_step[0], color_step[1], color_step[2]))
-                                edge_steps[direction] = direction_sign(direction) * adj_step
+                                edge_step = edge_colors[batch - fragment_batch, entry, direction] - color
+                                adj_step = wp.dot(adj_color, wp.vec3(edge_step[0], edge_step[1], edge_step[2]))
+                                edge_steps[direction] = wp.where(is_moving, direction_sign(direction) * adj_step, 0.0)
                                 distances[direction / 2] += t
                                 extents[direction / 2] += t - 0.5
                         elif edge[0] == NOTHING and has_neighbor(fragment, direction, width, fragments.height):
                             neighbor_sample = neighbor(sample, direction, width)
                             if receiver_face_ids[fragment_batch, neighbor_sample] >= 0:
-                                light_step = wp.dot(adj_light, light[light_batch, neighbor_sample] - sample_light)
-                                weighted_slopes[direction / 2] += direction_sign(direction) * 0.5 * light_step
+                                neighbor_light = light[light_batch, neighbor_sample]
+                                if not is_moving:
+                                    neighbor_light = sample_light
+                                color_step = wp.dot(adj_light, neighbor_light - sample_light)
+                                if is_albedo_moving:
+                                    albedo_step = albedo[albedo_batch, neighbor_sample] - albedo[albedo_batch, sample]
+                                    color_step += wp.dot(adj_color, wp.cw_mul(neighbor_light, albedo_step))
+                                weighted_slopes[direction / 2] += direction_sign(direction) * 0.5 * color_step
                                 distances[direction / 2] += 0.5
                 if wp.length_sq(edge_steps) > 0.0:
                     for direction in range(4):
@@ -304,6 +373,7 @@ def moving_radiance(
     clip_positions: wp.array,
     receivers: wp.array,
     has_mean_slope: wp.array | None = None,
+    albedo_has_mean_slope: wp.array | None = None,
 ) -> tuple[wp.array, wp.array]:
     """Radiance of samples of moving surfaces: :func:`warpshadow.stages.image.film.sample_radiance`, by mean slopes.
 
@@ -316,12 +386,13 @@ def moving_radiance(
         clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex].
         receivers: As for :func:`warpshadow.stages.silhouettes.edge_colors.find_edge_colors`.
         has_mean_slope: Of :func:`find_mean_slopes`, if the receivers were found with it.
+        albedo_has_mean_slope: The same without a quadtree, if albedo was found by :func:`hold_fragments`.
     Returns:
         Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width]; and the edge colors, with which
         :func:`warpshadow.stages.silhouettes.smooth.smooth_silhouettes` is to be called.
     Differentiable: shading, albedo, clip_positions; the latter in place of barycentrics of the fragments, but for the
     samples that are receivers themselves or interpolate between such, whose gradient is that of the receivers' points
-    unless they have mean slopes.
+    unless they have mean slopes. By albedo samples are moved where it has a mean slope.
     """
     fragments = replace(fragments, barycentrics=without_gradient(fragments.barycentrics))
     samples = sample_radiance(fragments, faces, shading, albedo)
@@ -350,6 +421,7 @@ def moving_radiance(
                 silhouettes.shares,
                 edge_colors,
                 has_mean_slope,
+                albedo_has_mean_slope,
                 len(silhouettes.faces) * (1 if silhouettes.fragments.sides is None else 2),
                 run,
                 rows(samples.grad),
