@@ -12,7 +12,7 @@ import warpshadow
 from warpshadow.device import batch, lanes
 from warpshadow.device.warp_internals import kernel_modules
 from warpshadow.spheres import refine
-from warpshadow.stages.bounces import sphere_light
+from warpshadow.stages.bounces import form_factors, sphere_light
 from warpshadow.stages.convex import coverage as convex
 from warpshadow.stages.gloss import lobes as glossy_lobes
 from warpshadow.stages.gloss import prefilter, traced_lobes
@@ -71,6 +71,7 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     "_make_look_up": lambda: prefilter._make_look_up(LANES)[0],
     "_make_look_up adjoint": lambda: prefilter._make_look_up(LANES)[1],
     "trace._make_trace": trace._make_trace,
+    "_make_sum_hits": form_factors._make_sum_hits,
     "sun_cells._make_trace": sun_cells._make_trace,
     "shared_rays._make_trace False": partial(shared_rays._make_trace, False),
     "shared_rays._make_trace True": partial(shared_rays._make_trace, True),

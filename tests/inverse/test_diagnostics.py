@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import warpshadow as ws
-from warpshadow.inverse import DiagnosticWarning, Exposure, Light, Pose, Problem, Stage, Target, Texture, fit
+from warpshadow.inverse import Albedo, DiagnosticWarning, Exposure, Light, Pose, Problem, Stage, Target, Texture, fit
 from warpshadow.inverse.diagnostics import gain_of_last
 
 
@@ -49,6 +49,15 @@ def test_a_texture_that_may_keep_a_shadow_is_told():
     assert message.startswith("the texture of 'ground' is free beside the pose of 'ball'")
     for free in ([moved], [painted], [moved, dataclasses.replace(painted, palette=1.0)]):
         assert not any("is free beside" in text for text in messages(Problem(both, target, free), Stage(1, 0.05)))
+
+
+def test_light_exposure_and_all_albedos_are_not_told_apart():
+    target, free = Target(ws.render(scene())[..., :3]), [Light(2), Exposure(), Albedo(0)]
+    told = [text for text in messages(Problem(scene(), target, free), Stage(1, 0.05)) if text.startswith("free:")]
+    assert len(told) == 1 and "got light, exposure and the reflectance of all bodies" in told[0]
+    for left_out in range(3):
+        known = Problem(scene(), target, free[:left_out] + free[left_out + 1 :])
+        assert not any(text.startswith("free:") for text in messages(known, Stage(1, 0.05)))
 
 
 def test_light_that_has_not_converged_is_told():

@@ -9,8 +9,9 @@ import torch
 
 from warpshadow import check
 from warpshadow.inverse.free.base import Values
+from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.pose import Pose
-from warpshadow.inverse.free.reflectance import Texture
+from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.views import Exposure
 from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.model import Model
@@ -111,7 +112,19 @@ def warn_of(
 
 
 def warn_before(problem: Problem) -> None:
-    """Warn of a pose and the texture of another body, both free, by one image: the texture may keep any shadow."""
+    """Warn of parameters that images do not tell apart.
+
+    These are the light, the exposure and the reflectance of all bodies; and, by one image, a pose and the texture of
+    another body, which may keep any shadow.
+    """
+    known_bodies = set(range(len(problem.scene.bodies))) - {free.number for free in problem.free_of(Albedo)}
+    known_bodies -= {free.number for free in problem.free_of(Texture)}
+    if {Light.key, Exposure.key} <= {free.key for free in problem.free} and not known_bodies:
+        check.warn(
+            "free: got light, exposure and the reflectance of all bodies, expected one of these to be known: images "
+            "show their product alone, so each may be wrong by any factor; leave out Exposure, or a body's Albedo",
+            DiagnosticWarning,
+        )
     poses = {pose.number for pose in problem.free_of(Pose)}
     textures = [texture.number for texture in problem.free_of(Texture) if not texture.palette]
     names = [body.name for body in problem.scene.bodies]

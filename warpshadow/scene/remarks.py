@@ -93,6 +93,17 @@ def misplacements(scene: Scene) -> list[str]:
     return remarks
 
 
+def grounds_of(scene: Scene) -> list[int]:
+    """Numbers of the bodies that are grounds, cast shadows, and are as broad as all bodies."""
+    boxes = [_Box(points.min(axis=0), points.max(axis=0)) for points in (b.world_points() for b in scene.bodies)]
+    broadest = max(box.breadth for box in boxes)
+    return [
+        number
+        for number, (body, box) in enumerate(zip(scene.bodies, boxes, strict=True))
+        if _CEILING_RATIO * box.breadth >= broadest and body.casts_shadow and _is_ground(body, box)
+    ]
+
+
 def enclosures(scene: Scene, cameras: Iterable[Camera]) -> list[str]:
     """Warn of the first camera inside a body, and name the body.
 

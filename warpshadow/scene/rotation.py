@@ -6,6 +6,8 @@ import numpy.typing as npt
 from warpshadow import check
 from warpshadow.assets.camera import check_rotation
 
+_ROUNDED = 2e-3  # difference from an eighth of a turn [radians] up to which an angle is one, such as 3.14
+
 
 def rotation_vector(value: npt.ArrayLike) -> np.ndarray:
     """The axis-angle vector [degrees] of a rotation, float64 of shape [3].
@@ -25,14 +27,29 @@ def rotation_vector(value: npt.ArrayLike) -> np.ndarray:
             "scipy.spatial.transform.Rotation.from_quat((x, y, z, w)).as_matrix(), with the real part w last"
         )
     if matrix.shape != (3, 3):
-        return check.array("rotation", value, (3,), meaning)
+        vector = check.array("rotation", value, (3,), meaning)
+        _warn_of_radians(vector)
+        return vector
     from scipy.spatial.transform import Rotation
 
     check.finite("rotation", matrix)
     check_rotation("rotation", matrix)
-    vector: np.ndarray = Rotation.from_matrix(matrix).as_rotvec(degrees=True)
+    vector = np.asarray(Rotation.from_matrix(matrix).as_rotvec(degrees=True))
     vector.setflags(write=False)
     return vector
+
+
+def _warn_of_radians(vector: np.ndarray) -> None:
+    """Warn of a turn about an axis of the world by an eighth of a turn, or several, as it is in radians."""
+    angle = np.abs(vector).max()
+    eighths = angle / (np.pi / 4)
+    if np.count_nonzero(vector) == 1 and 0.5 < eighths < 8.5 and abs(eighths - round(eighths)) * np.pi / 4 < _ROUNDED:
+        x, y, z = vector.tolist()
+        degrees = ", ".join(f"{number:.0f}" for number in np.degrees(vector))
+        check.warn(
+            f"rotation: got ({x:g}, {y:g}, {z:g}), a turn by {angle:g}°, expected degrees; if it is in radians, "
+            f"({degrees}) is meant"
+        )
 
 
 def rotation_matrix(vector: np.ndarray) -> np.ndarray:

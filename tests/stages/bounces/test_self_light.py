@@ -1,5 +1,7 @@
 """Form factors against analytic ones and visibility, and a body's light on itself against NumPy."""
 
+import time
+
 import numpy as np
 import pytest
 import twins
@@ -62,6 +64,27 @@ def test_a_receiver_sees_patches_where_they_are(device):
     expected = patches.areas * (offsets[:, 1] / distance) ** 2 / (np.pi * distance**2)
     count = patches.count // 2
     np.testing.assert_allclose(factors.toarray()[0, :count], expected[:count], atol=0.1 * expected.max())
+
+
+def test_rays_go_in_packets_of_sixteen(device):
+    for count in (8, 100):
+        with pytest.raises(ValueError, match=f"rays: got {count}, expected a positive multiple of 16"):
+            factors_of(square(1.0), np.zeros((1, 3)), np.array([[0.0, 1, 0]]), device, rays=count)
+
+
+def test_a_convex_body_is_found_to_see_nothing_of_itself_in_a_fifth_of_the_time_of_one_that_does():
+    """Rays that meet nothing are told apart sixteen at once; one by one both take 0.6 µs a ray."""
+    mesh, seconds = ws.icosphere(1.0, 4), []
+    patches = find_patches(mesh.positions, mesh.surface.faces, is_two_sided=True)
+    traced = patch_mesh(patches, mesh.positions, mesh.surface.faces, device="cpu")
+    for side in (1, 1, -1):  # the first compiles
+        start = time.process_time()
+        factors = trace_form_factors(
+            traced, patches.patch_of_pieces, patches.count, mesh.positions, side * mesh.positions
+        )
+        seconds.append(time.process_time() - start)
+        assert (factors.nnz == 0) == (side > 0)
+    assert seconds[1] < seconds[2] / 5
 
 
 def test_a_receiver_without_a_normal_sees_nothing(device):

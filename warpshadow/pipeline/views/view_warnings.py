@@ -6,7 +6,9 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.receivers.choice_of_receivers import face_sizes, warn_of_coarse_faces
 from warpshadow.pipeline.views.view import View
+from warpshadow.scene.black_metals import black_metals
 from warpshadow.scene.body import Body
+from warpshadow.scene.low_sun import sun_below
 from warpshadow.scene.remarks import blurred_shell, enclosures, lined_surfaces, misplacements, rounded_edges
 
 
@@ -19,7 +21,7 @@ def warn_of_view(view: View, cameras: Sequence[Camera] | None) -> bool:
     remarks, scene = [view.emptiness()], view.merged_scene.scene
     if cameras is not None:
         remarks += [*enclosures(scene, cameras), *misplacements(scene), *rounded_edges(scene), *lined_surfaces(scene)]
-        remarks += blurred_shell(scene)
+        remarks += [*blurred_shell(scene), *sun_below(scene), *black_metals(scene)]
     if result := [remark for remark in remarks if remark]:
         check.warn("; ".join(result))
     return bool(result)

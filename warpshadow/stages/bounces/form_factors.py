@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from warpshadow import check
+from warpshadow.device.lanes import lane_type, module_options, vectors_type
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import zeros
+from warpshadow.maths.directions import check_count
+from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.stages.bounces.bright_patches import BrightPatches, hit_weight, point_of_bright_side
 from warpshadow.stages.patches import Patches
+from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open, packets_of
 from warpshadow.stages.rays.ray_tracing import RAY_COST, first_hit, progress_slices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
+
+ALL_RAYS = wp.constant((1 << PACKET) - 1)  # of a packet, which traces at once which of them meet anything
+
+_Lane = lane_type(PACKET)
 
 _MAX_HITS = 1 << 22  # sums of hits that are held at once [receivers × patches]
 
@@ -29,61 +38,91 @@ _BURIED_SHARE = 0.5
 """Part of its hemisphere from which a point that sees insides of closed bodies counts as inside one itself."""
 
 
-@wp.kernel(enable_backward=False)
-def _sum_hits(
-    first_row: int,
-    worker: int,
-    # in
-    mesh: wp.uint64,
-    corners: wp.array(dtype=wp.vec3),
-    patch_of_sides: wp.array2d(dtype=wp.int32),
-    bright: BrightPatches,
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    first_receiver: int,
-    ray_count: int,
-    # out
-    hits: wp.array2d(dtype=wp.float32),
-):
-    """A thread owns a receiver, whose hits are zero before."""
-    receiver = first_row + wp.tid()
-    point = points[receiver]
-    normal = normals[receiver]
-    if wp.length_sq(normal) == 0.0:
-        return
-    sign = wp.where(normal[2] < 0.0, -1.0, 1.0)  # [Duff et al. 2017]
-    duff_a = -1.0 / (sign + normal[2])
-    duff_b = normal[0] * normal[1] * duff_a
-    tangent = wp.vec3(1.0 + sign * normal[0] * normal[0] * duff_a, sign * duff_b, -sign * normal[0])
-    bitangent = wp.vec3(duff_b, sign + normal[1] * normal[1] * duff_a, -normal[1])
-    state = wp.rand_init(29, first_receiver + receiver)
-    first_turn = wp.randf(state)
-    for ray in range(ray_count):
-        # a Fibonacci lattice on the disc below the hemisphere: so directions are as dense as their cosine is large
-        radius2 = (float(ray) + 0.5) / float(ray_count)
-        angle = 2.0 * wp.pi * (first_turn + wp.frac(float(ray) * GOLDEN_TURN))
-        radius = wp.sqrt(radius2)
-        ray_direction = (
-            radius * wp.cos(angle) * tangent + radius * wp.sin(angle) * bitangent + wp.sqrt(1.0 - radius2) * normal
-        )
-        hit = first_hit(mesh, point, normal, ray_direction)
-        if hit.face >= 0:
-            patch = patch_of_sides[wp.where(hit.is_back, 1, 0), hit.face]
-            if patch >= 0:
-                hits[receiver, patch] += hit_weight(
-                    bright, patch, corners, hit.face, point, normal, ray_direction, ray_count
-                )
-    for ray in range(bright.ray_count):
-        share = (float(ray) + wp.randf(state)) / float(bright.ray_count)
-        side, target = point_of_bright_side(bright, corners, share, wp.randf(state), wp.randf(state))
-        ray_direction = wp.normalize(target - point)
-        if wp.dot(normal, ray_direction) > 0.0:
-            hit = first_hit(mesh, point, normal, ray_direction)
-            if hit.face >= 0 and side == hit.face + wp.where(hit.is_back, patch_of_sides.shape[1], 0):
-                patch = patch_of_sides[wp.where(hit.is_back, 1, 0), hit.face]
-                hits[receiver, patch] += hit_weight(
-                    bright, patch, corners, hit.face, point, normal, ray_direction, ray_count
-                )
+@functools.cache
+def _make_sum_hits() -> wp.Kernel:
+    Vectors, find_open = vectors_type(PACKET), make_find_open()
+
+    @wp.kernel(module="unique", module_options=module_options(PACKET), enable_backward=False)
+    def sum_hits(
+        first_row: int,
+        worker: int,
+        # in
+        mesh: wp.uint64,
+        tree: FaceTree,
+        corners: wp.array(dtype=wp.vec3),
+        patch_of_sides: wp.array2d(dtype=wp.int32),
+        bright: BrightPatches,
+        points: wp.array(dtype=wp.vec3),
+        normals: wp.array(dtype=wp.vec3),
+        lattice: wp.array2d(dtype=_Lane),
+        first_receiver: int,
+        # out
+        hits: wp.array2d(dtype=wp.float32),
+    ):
+        """A thread owns a receiver, whose hits are zero before."""
+        receiver = first_row + wp.tid()
+        point = points[receiver]
+        normal = normals[receiver]
+        if wp.length_sq(normal) == 0.0:
+            return
+        sign = wp.where(normal[2] < 0.0, -1.0, 1.0)  # [Duff et al. 2017]
+        duff_a = -1.0 / (sign + normal[2])
+        duff_b = normal[0] * normal[1] * duff_a
+        tangent = wp.vec3(1.0 + sign * normal[0] * normal[0] * duff_a, sign * duff_b, -sign * normal[0])
+        bitangent = wp.vec3(duff_b, sign + normal[1] * normal[1] * duff_a, -normal[1])
+        state = wp.rand_init(29, first_receiver + receiver)
+        turn = 2.0 * wp.pi * wp.randf(state)
+        u = wp.cos(turn) * tangent + wp.sin(turn) * bitangent
+        v = wp.cos(turn) * bitangent - wp.sin(turn) * tangent
+        ray_count = PACKET * lattice.shape[0]
+        last_face = int(-1)
+        for packet in range(lattice.shape[0]):
+            x = lattice[packet, 0]
+            y = lattice[packet, 1]
+            z = lattice[packet, 2]
+            rays = Vectors(
+                u[0] * x + v[0] * y + normal[0] * z,
+                u[1] * x + v[1] * y + normal[1] * z,
+                u[2] * x + v[2] * y + normal[2] * z,
+            )
+            open_rays, last_face = find_open(tree, point, normal, rays, ALL_RAYS, last_face)
+            if open_rays != ALL_RAYS:
+                for lane in range(PACKET):
+                    if (open_rays >> lane) & 1 == 0:
+                        ray_direction = wp.vec3(rays.x[lane], rays.y[lane], rays.z[lane])
+                        hit = first_hit(mesh, point, normal, ray_direction)
+                        if hit.face >= 0:
+                            patch = patch_of_sides[wp.where(hit.is_back, 1, 0), hit.face]
+                            if patch >= 0:
+                                hits[receiver, patch] += hit_weight(
+                                    bright, patch, corners, hit.face, point, normal, ray_direction, ray_count
+                                )
+        for ray in range(bright.ray_count):
+            share = (float(ray) + wp.randf(state)) / float(bright.ray_count)
+            side, target = point_of_bright_side(bright, corners, share, wp.randf(state), wp.randf(state))
+            ray_direction = wp.normalize(target - point)
+            if wp.dot(normal, ray_direction) > 0.0:
+                hit = first_hit(mesh, point, normal, ray_direction)
+                if hit.face >= 0 and side == hit.face + wp.where(hit.is_back, patch_of_sides.shape[1], 0):
+                    patch = patch_of_sides[wp.where(hit.is_back, 1, 0), hit.face]
+                    hits[receiver, patch] += hit_weight(
+                        bright, patch, corners, hit.face, point, normal, ray_direction, ray_count
+                    )
+
+    return sum_hits
+
+
+@functools.cache
+def _lattice(ray_count: int) -> np.ndarray:
+    """A Fibonacci lattice on the disc below the hemisphere: so directions are as dense as their cosine is large.
+
+    Returns:
+        Unit vectors around +z, each run of 16 compact, of shape [ray, 3].
+    """
+    radius2 = (np.arange(ray_count) + 0.5) / ray_count
+    angle = 2 * np.pi * GOLDEN_TURN * np.arange(ray_count)
+    directions = np.stack([*(np.sqrt(radius2) * (np.cos(angle), np.sin(angle))), np.sqrt(1 - radius2)], axis=1)
+    return directions[compact_order(directions)]
 
 
 def patch_mesh(patches: Patches, positions: np.ndarray, faces: np.ndarray, *, device: wp.DeviceLike) -> wp.Mesh:
@@ -127,7 +166,7 @@ def trace_form_factors(
         count: Number of patches.
         points: Receivers, which may lie on the mesh, shape [receiver, 3].
         normals: Unit normals, shape [receiver, 3]. Where one is zero nothing is seen.
-        rays: Rays of each receiver in all directions.
+        rays: Rays of each receiver in all directions, a multiple of 16.
         bright: Patches of the mesh that more rays are sent to; None for none.
         progress: Print how far it is.
     Returns:
@@ -139,16 +178,20 @@ def trace_form_factors(
     check.shape("patch_of_sides", patch_of_sides.shape, (2, "face"))
     check.shape("points", points.shape, ("receiver", 3))
     check.shape("normals", normals.shape, points.shape)
+    check_count("rays", rays)
     device = mesh.device
     patch_array = wp.array(patch_of_sides, dtype=wp.int32, device=device)
     bright = BrightPatches() if bright is None else bright
     ray_count = rays + bright.ray_count
+    corners = mesh.points.numpy()[mesh.indices.numpy()]
+    tree = build_face_tree(corners, np.arange(len(corners)).reshape(-1, 3), device)
+    lattice = wp.array(packets_of(_lattice(rays)), dtype=_Lane, device=device)
     factors = []
     for receivers in progress_slices(len(points), _MAX_HITS // max(count, 1), progress):
         hits = zeros((receivers.stop - receivers.start, count), dtype=wp.float32, device=device)
         receiver_arrays = [wp.array(values[receivers], dtype=wp.vec3, device=device) for values in (points, normals)]
-        inputs = [mesh.id, mesh.points, patch_array, bright, *receiver_arrays, receivers.start, rays]
-        launch(_sum_hits, len(receiver_arrays[0]), inputs=inputs, outputs=[hits], cost=RAY_COST * ray_count)
+        inputs = [mesh.id, tree, mesh.points, patch_array, bright, *receiver_arrays, lattice, receivers.start]
+        launch(_make_sum_hits(), len(receiver_arrays[0]), inputs=inputs, outputs=[hits], cost=RAY_COST * ray_count)
         factors.append(csr_matrix(hits.numpy()))
     if not factors:
         return csr_matrix((0, count), dtype=np.float32)
