@@ -113,6 +113,10 @@ class Method(abc.ABC):
         is_known = not (self.every_sample_receives or self.has_emitters or self.shell is not None)
         return adaptive & self.merged_scene.is_flat & is_known
 
+    def blocker_notes(self, blocker_kinds: BlockerKinds) -> list[str]:
+        """Say as what each body blocks light, and why, a line each; nothing where all do by rays, or none does."""
+        return []
+
     def find_squares(self, blocker_kinds: BlockerKinds, surfaces: VisibleSurfaces) -> Quadtree | None:
         """Find the squares in which samples of adaptive bodies interpolate (:func:`.adaptive.find_squares`)."""
         return None
