@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
-from warpshadow.scene.black_metals import black_metals
-from warpshadow.scene.low_sun import sun_below
+from warpshadow.scene.remarks import black_metals, sun_below
 
 GROUND = ws.Body(ws.plane(4.0, 1), name="ground")
 SKY = ws.EnvironmentMap.constant(0.2, height=64)

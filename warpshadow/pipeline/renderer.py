@@ -481,7 +481,8 @@ class SceneRenderer:
         is_host = self.device.is_cpu or self.clock.waits
         of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging_bodies)
         of_bounces = self._transport.notes(preview, light, materials)
-        notes = [*of_receivers, *of_bounces, *shell_notes(self.scene.shell)]
+        of_blockers = self._method.blocker_notes(view.blocker_kinds)
+        notes = [*of_receivers, *of_blockers, *of_bounces, *shell_notes(self.scene.shell)]
         return Explanation(
             image, self._views.call(view), self.clock.timings, is_host=is_host, hidden=hidden, notes=notes
         )

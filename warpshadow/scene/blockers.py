@@ -194,6 +194,22 @@ def free_shape_remark(scene: Scene, number: int) -> str:
     )
 
 
+def why_spheres_block(scene: Scene, number: int) -> str:
+    """Why a body that casts shadows blocks light by spheres, in words after a colon."""
+    visibility, body = scene.visibility.with_method(), scene.bodies[number]
+    if visibility.method != "directional":
+        return f": {visibility.method} has no planes and no convex parts"
+    if not isinstance(body.blockers, str):
+        return ": its blockers ask for them"
+    if body.self_shadows_in(visibility) == "spheres":
+        return ': self_shadows = "spheres" asks for them'
+    if _solid_behind(scene, number) is not None:
+        return ", of the solid behind it: it is land"
+    if body.mesh.convex_parts:
+        return ": they cast the shadow of its convex parts, in less time"
+    return ": it is neither flat, nor made of few convex parts or panels"
+
+
 def _announce(fits: Iterable[FitRequest], device: wp.DeviceLike, progress: bool) -> None:
     """Say how long fits that are to be made take, if that is long."""
     requested = set(fits)

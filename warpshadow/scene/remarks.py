@@ -1,4 +1,6 @@
-"""Remarks on a scene: where bodies stand, normals that show as lines or dark edges, and light that is blurred."""
+"""Remarks on a scene: where bodies stand, normals that show as lines or dark edges, light that is blurred or
+hidden, metals that are black.
+"""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -16,6 +18,9 @@ from warpshadow.scene.scene import Scene
 _HALF = 0.5  # share of all light that is looked for in the brightest part of a shell
 _GROUND_COSINE = 0.99  # cosine of the angle to +y up to which a flat body is a ground
 _CEILING_RATIO = 1.01  # ratio of breadths up to which a body is as broad as its ground, such as a ceiling
+_SUN_SHARE = 0.01  # of all directions, from which half of the light comes where there is a sun
+_LOW_SUN = -0.02  # height of the direction to a sun from which on it is below the horizon, by more than its rim
+_METAL = 0.5  # share of metal from which a body is one
 
 
 class _Box(NamedTuple):
@@ -172,4 +177,46 @@ def blurred_shell(scene: Scene) -> list[str]:
         f"light: half of it comes from {share:.2%} of its shell, less than one of the {scene.direction_count} cells "
         "through which bodies block it, so its shadows are blurred; stills have them sharp, as lamps do, "
         "Body(…, emission=…), and Visibility(directions=…) blurs them less"
+    ]
+
+
+def sun_below(scene: Scene) -> list[str]:
+    """Remark on a map whose sun is below the horizon, where a body that casts shadows is a ground, broader than all."""
+    light = scene.known_light
+    if not isinstance(light, EnvironmentMap) or light.shell is not None or not grounds_of(scene):
+        return []
+    solid_angles = np.repeat(light.solid_angles(), light.radiance.shape[1])
+    luminance = light.radiance.mean(axis=2, dtype=np.float64).ravel()
+    brightest = (-luminance).argsort()
+    powers = (luminance * solid_angles)[brightest]
+    sun = brightest[: np.searchsorted(powers.cumsum(), powers.sum() / 2) + 1]
+    if not powers.sum() or solid_angles[sun].sum() > _SUN_SHARE * 4 * np.pi:
+        return []
+    direction = powers[: len(sun)] @ light.directions().reshape(-1, 3)[sun]
+    direction /= max(np.linalg.norm(direction), 1e-12)
+    if direction[1] > _LOW_SUN:
+        return []
+    x, y, z = direction.tolist()
+    number = grounds_of(scene)[0]
+    return [
+        f"light: its sun is at ({x:.2g}, {y:.2g}, {z:.2g}), below body {number} ({scene.bodies[number].name!r}), which "
+        "keeps its light from the others; y of a direction towards the sun is above 0"
+    ]
+
+
+def black_metals(scene: Scene) -> list[str]:
+    """Remark on bodies of metal beside others, in a scene without bounces."""
+    if scene.bounces or len(scene.bodies) < 2:
+        return []
+    metals = [
+        f"body {number} ({body.name!r})"
+        for number, body in enumerate(scene.bodies)
+        if body.is_glossy and body.metallic is not None and np.mean(body.metallic) > _METAL
+    ]
+    if not metals:
+        return []
+    are, show = ("is of metal", "shows") if len(metals) == 1 else ("are of metal", "show")
+    return [
+        f"{', '.join(metals)} {are}, which {show} other bodies black where light does not bounce: got bounces=0; "
+        'Scene(…, bounces="all"), in scene files bounces = "all", has them mirrored'
     ]

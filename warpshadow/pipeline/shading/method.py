@@ -87,6 +87,10 @@ class Method(abc.ABC):
         """
         return ONLY_SPHERES
 
+    def blocker_notes(self, blocker_kinds: BlockerKinds) -> list[str]:
+        """Say as what each body blocks light, and why, a line each; nothing where all do by rays, or none does."""
+        return []
+
     def find_squares(self, blocker_kinds: BlockerKinds, surfaces: AdaptiveSurfaces) -> Quadtree | None:
         """Find the squares in which samples of adaptive bodies interpolate (:func:`.adaptive.find_squares`)."""
         return None

@@ -15,6 +15,7 @@ from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Blockers, BodySides
 from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
+from warpshadow.scene.blockers import why_spheres_block
 
 
 class SceneBlockers:
@@ -124,6 +125,28 @@ class SceneBlockers:
             return item_text
         moving = list(points.static_bodies.moving)
         return f"{item_text}, {receiver_text(points, moving=False)} on static bodies × {blockers(moving)}"
+
+    def notes(self, kinds: BlockerKinds) -> list[str]:
+        """Say as what each body blocks the light of others, and its own, and why; a line each."""
+        return [
+            f"Body {number} ({body.name!r}) blocks light {self._kind_in_words(number, kinds)}."
+            for number, body in enumerate(self._merged_scene.scene.bodies)
+            if body.casts_shadow
+        ]
+
+    def _kind_in_words(self, body: int, kinds: BlockerKinds) -> str:
+        if body in kinds.planes:
+            return "as a part of a plane: it is flat"
+        count = int(self._part_counts(kinds)[body])
+        parts = f"as {count} convex part{'s' * (count != 1)}"
+        if body in kinds.solids:
+            return f"{parts}, its own, too: it consists of them"
+        why = kinds.why_spheres[body] if kinds.why_spheres else "the method looks up no rays"
+        of_its_own = f"and its own by {f'spheres: {why}' if why else 'rays, traced once'}"
+        if body in kinds.convex:
+            return f"{parts}, {of_its_own}"
+        spheres = f"as {self._merged_scene.sphere_counts[body]} spheres"
+        return f"{spheres}{why_spheres_block(self._merged_scene.scene, body)}, {of_its_own}"
 
     def why_none_is_traced(self, kinds: BlockerKinds) -> str:
         """Why no body's shadow on itself is looked up."""

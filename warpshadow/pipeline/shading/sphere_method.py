@@ -96,6 +96,10 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         """Choose the kind of blocker that each body of a geometry is; the scene's geometry by default."""
         return self.scene_blockers.kinds(geometry, rotations)
 
+    def blocker_notes(self, blocker_kinds: BlockerKinds) -> list[str]:
+        """Say as what each body blocks light, and why, a line each."""
+        return [] if self.why_no_shadows else self.scene_blockers.notes(blocker_kinds)
+
     def find_visibility_past_planes(
         self, group: Group, visibility: FoundVisibility, projected_light: Projected
     ) -> FoundVisibility:

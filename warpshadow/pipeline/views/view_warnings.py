@@ -6,10 +6,16 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.receivers.choice_of_receivers import face_sizes, warn_of_coarse_faces
 from warpshadow.pipeline.views.view import View
-from warpshadow.scene.black_metals import black_metals
 from warpshadow.scene.body import Body
-from warpshadow.scene.low_sun import sun_below
-from warpshadow.scene.remarks import blurred_shell, enclosures, lined_surfaces, misplacements, rounded_edges
+from warpshadow.scene.remarks import (
+    black_metals,
+    blurred_shell,
+    enclosures,
+    lined_surfaces,
+    misplacements,
+    rounded_edges,
+    sun_below,
+)
 
 
 def warn_of_view(view: View, cameras: Sequence[Camera] | None) -> bool:
