@@ -88,7 +88,7 @@ class Method(abc.ABC):
         return ONLY_SPHERES
 
     def blocker_notes(self, blocker_kinds: BlockerKinds) -> list[str]:
-        """Say as what each body blocks light, and why, a line each; nothing where all do by rays, or none does."""
+        """Describe how each body blocks light, and why, a line each; nothing where all do by rays, or none does."""
         return []
 
     def find_squares(self, blocker_kinds: BlockerKinds, surfaces: AdaptiveSurfaces) -> Quadtree | None:

@@ -89,5 +89,5 @@ def _find_hits(
 
 
 def _of(array: wp.array, instance: int) -> wp.array:
-    """An instance's part of a batch, of which the last serves the rest."""
+    """Array of one instance of a batch; the last instance serves all later ones."""
     return array[min(instance, len(array) - 1)]

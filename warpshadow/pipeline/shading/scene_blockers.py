@@ -127,7 +127,7 @@ class SceneBlockers:
         return f"{item_text}, {receiver_text(points, moving=False)} on static bodies × {blockers(moving)}"
 
     def notes(self, kinds: BlockerKinds) -> list[str]:
-        """Say as what each body blocks the light of others, and its own, and why; a line each."""
+        """Describe how each body blocks the light of others, and its own, and why; a line each."""
         return [
             f"Body {number} ({body.name!r}) blocks light {self._kind_in_words(number, kinds)}."
             for number, body in enumerate(self._merged_scene.scene.bodies)

@@ -97,7 +97,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         return self.scene_blockers.kinds(geometry, rotations)
 
     def blocker_notes(self, blocker_kinds: BlockerKinds) -> list[str]:
-        """Say as what each body blocks light, and why, a line each."""
+        """Describe how each body blocks light, and why, a line each."""
         return [] if self.why_no_shadows else self.scene_blockers.notes(blocker_kinds)
 
     def find_visibility_past_planes(

@@ -159,7 +159,7 @@ class View(LitPoints):
         return self._reflectance_of(materials, self.fragments_node)
 
     def _moving_reflectance(self, materials: Materials) -> SampleReflectance:
-        """The same for :meth:`_radiance`."""
+        """Nodes of the reflectance that :meth:`_radiance` takes, whose patterns move by mean slopes near outlines."""
         return self._reflectance_of(materials, self._patterned(materials)[0])
 
     def _reflectance_of(self, materials: Materials, fragments: Node) -> SampleReflectance:
