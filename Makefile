@@ -10,7 +10,7 @@ demo: $(INSTALLED)
 	$(BIN)/python demos/examples/bunny.py
 
 # a process a core; those of a file share its kernels. Threads of torch and NumPy would wait for those of other processes
-PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist loadfile
+PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 
 test: $(INSTALLED)
 	$(PYTEST)
@@ -42,11 +42,12 @@ docs: $(INSTALLED)
 install-check:
 	PYTHON=$(PYTHON) .ci/install
 
-# torch first: the pinned release has a CPU build where an index offers one, and nothing later replaces it
+# torch first: the pinned release has a CPU build where an index offers one, and nothing later replaces it. Python compiles
+# what it imports when it does: most of these packages it never needs
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt torch
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e ".[dev]"
 	touch $@
 
 clean:
