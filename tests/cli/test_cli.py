@@ -4,10 +4,8 @@ import dataclasses
 import errno
 import functools
 import re
-import signal
 import subprocess
 import sys
-import time
 from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -712,24 +710,6 @@ def test_a_fit_that_is_interrupted_before_a_checkpoint_says_so(fit_file, tmp_pat
         result = run("fit", fit_file, "-o", tmp_path / "out")
     assert result.exit_code == 130 and "interrupted before a checkpoint; the same command starts over" in result.stderr
     assert run("fit", fit_file, "-o", tmp_path / "out").exit_code == 0
-
-
-@pytest.mark.slow
-def test_a_fit_whose_process_was_killed_ends_where_it_would_have(fit_file, tmp_path):
-    fit_file.write_text(FIT.replace("iterations = 60", "iterations = 400"))
-    folder = tmp_path / "out"
-    command = [*PROGRAM, "fit", str(fit_file), "-o", str(folder), "--checkpoint-seconds", "0"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        deadline = time.monotonic() + 120
-        while not (folder / "checkpoint.previous").exists() and process.poll() is None:
-            assert time.monotonic() < deadline
-            time.sleep(0.005)
-        process.kill()
-    assert process.returncode == -signal.SIGKILL, "the fit was over before it could be killed"
-    assert not (folder / "scene.toml").exists()
-    assert "going on" in run("fit", fit_file, "-o", folder).stderr
-    run("fit", fit_file, "-o", tmp_path / "whole")
-    assert_same(parameters(folder), parameters(tmp_path / "whole"))
 
 
 def test_a_fit_that_diverges_is_status_3_and_keeps_what_it_had(fit_file, tmp_path):

@@ -7,7 +7,7 @@ from demos.tools import kernel_report
 from demos.tools.cuda_kernels import FACTORIES, file_modules
 from demos.tools.kernel_report import BUDGETS
 
-ARCHITECTURES = [75, 80, 90]
+ARCHITECTURES = [75, 90]  # the oldest and the newest: each compiles anew
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Scenes of all kinds: how errors are measured, and four of the scenes, small."""
+"""Scenes of all kinds: how errors are measured, and two of the scenes, small."""
 
 import dataclasses
 import functools
@@ -16,8 +16,8 @@ from warpshadow.pipeline.bounces import self_form_factors
 
 SMALL = 40  # pixels across
 
-# relative L2 error of four scenes, with spheres that are not fitted, half again as much as measured
-BOUNDS = {"bowl": 0.33, "letters": 0.12, "shelf": 0.33, "tent": 0.46}
+# relative L2 error of two scenes, with spheres that are not fitted, half again as much as measured
+BOUNDS = {"bowl": 0.33, "letters": 0.12}
 
 
 @pytest.fixture
@@ -154,7 +154,7 @@ def test_scenes_have_all_that_they_are_about_in_sight():
 
 
 @pytest.mark.slow
-def test_four_scenes_are_measured_and_drawn(tmp_path, monkeypatch, capsys):
+def test_two_scenes_are_measured_and_drawn(tmp_path, monkeypatch, capsys):
     """In this process, with spheres that need no fit and form factors of few rays, so that it takes seconds."""
     monkeypatch.setattr(bench, "SCENES", {name: with_quick_spheres(kinds.SCENES[name]) for name in BOUNDS})
     monkeypatch.setattr(bench, "ProcessPoolExecutor", Here)

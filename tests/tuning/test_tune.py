@@ -393,8 +393,7 @@ def test_auto_of_a_scene_with_bounces_has_shadows_and_bounces(few):
     assert (chosen.visibility.method, chosen.bounces) == ("directional", 1)
 
 
-@pytest.mark.parametrize("bounces", [0, 1])
-@pytest.mark.parametrize("feature", ["gloss", "emission", "near light"])
+@pytest.mark.parametrize(("feature", "bounces"), [("gloss", 0), ("gloss", 1), ("emission", 0), ("near light", 1)])
 def test_scenes_of_which_one_method_shows_all_are_tuned_and_left_to_auto(few, feature, bounces):
     scene = dataclasses.replace(make_scene(), bounces=bounces)
     ball, ground = scene.bodies
