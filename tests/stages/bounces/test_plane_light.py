@@ -105,9 +105,8 @@ def random_steps(setting, number, size=1e-6):
     return steps
 
 
-@pytest.mark.parametrize("two_sided", [False, True])
-@pytest.mark.parametrize("names", [("ground",), ("l",), ("ground", "wall", "l")])
-@pytest.mark.parametrize("coverage", ["outline", "texels"])
+@pytest.mark.parametrize(("two_sided", "coverage"), [(False, "outline"), (True, "outline"), (True, "texels")])
+@pytest.mark.parametrize("names", [("l",), ("ground", "wall", "l")])
 def test_gradients_of_light_are_those_of_the_twin(names, two_sided, coverage, device, verified_tape, monkeypatch):
     if coverage == "texels":
         monkeypatch.setattr(plane_blockers, "MAX_EDGES", 5)
