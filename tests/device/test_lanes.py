@@ -156,6 +156,6 @@ def test_results_and_gradients_do_not_depend_on_the_number_of_lanes(part, tolera
         return part(lambda shape: rng.normal(size=shape))
 
     expected = values(16)
-    for count in (1, 4, 8):
+    for count in (1, 8):  # each compiles for ten seconds
         for got, same in zip(values(count), expected, strict=True):
             assert np.linalg.norm(got - same) <= tolerance * np.linalg.norm(same), count

@@ -113,7 +113,7 @@ def shell(name, height, noise=0.0, axis=1):
     return ball.vertices + noise * np.random.default_rng(0).normal(size=ball.vertices.shape), faces
 
 
-@pytest.mark.parametrize("height", [0.2, 0.3, 0.5, 0.6, 0.8])
+@pytest.mark.parametrize("height", [0.2, 0.5, 0.8])
 @pytest.mark.parametrize("name", SHELLS)
 def test_shells_have_panels_however_they_are_tessellated(name, height):
     points, faces = shell(name, height, axis=2 if "of" in name else 1)

@@ -147,18 +147,17 @@ def test_leaves_of_an_infinite_ground_do_not_widen_others(size):
     assert np.median((uppers - lowers - extent).max(axis=1) / extent.max(axis=1)) < 1e-4
 
 
-@pytest.mark.parametrize(("supersampling", "size"), [(1, 64), (2, 40), (3, 32)])
+@pytest.mark.parametrize(("supersampling", "size"), [(1, 64), (3, 32)])
 def test_a_still_is_within_three_percent_of_rays(supersampling, size):
     rays = ws.Visibility("ray-traced", samples=4096 * supersampling**2)
     truth = ws.render(scene(size, visibility=rays, supersampling=supersampling))
     assert error(ws.render(scene(size, supersampling=supersampling)), truth) < STILL_ERROR
 
 
-@pytest.mark.parametrize("bounces", [1, "all"])
-def test_a_still_with_bounces_is_near_paths(bounces):
+def test_a_still_with_bounces_is_near_paths():
     red = scene(48).bodies[1]
     bodies = scene(48).bodies[0], dataclasses.replace(red, albedo=(0.9, 0.2, 0.1))
-    given = dataclasses.replace(scene(48, bounces=bounces), bodies=bodies)
+    given = dataclasses.replace(scene(48, bounces="all"), bodies=bodies)
     truth = ws.render(dataclasses.replace(given, visibility=ws.Visibility("ray-traced", samples=4096)))
     assert error(ws.render(given), truth) < BOUNCED_ERROR
 
