@@ -91,7 +91,7 @@ def test_a_body_between_blocks_and_a_body_behind_does_not():
         assert (blocked < 0.1 * open_ground).mean() > 0.01 and blocked.mean() < 0.99 * open_ground.mean()
 
 
-@pytest.mark.parametrize("bounces", [0, 2, "all"])
+@pytest.mark.parametrize("bounces", [0, "all"])
 def test_light_of_emitters_adds_to_that_of_the_map_and_is_linear_in_emission(bounces):
     twice = dataclasses.replace(LAMP, emission=(12, 10, 8))
     options = {"bounces": bounces, "visibility": ws.Visibility("directional")}
@@ -101,8 +101,7 @@ def test_light_of_emitters_adds_to_that_of_the_map_and_is_linear_in_emission(bou
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bounces", [1, "all"])
-def test_light_of_emitters_bounces_as_along_paths(bounces):
+def test_light_of_emitters_bounces_as_along_paths():
     walls = [GROUND, dataclasses.replace(GROUND, rotation=(90, 0, 0), translation=(0, 0, -1), name="back")]
     bodies = LAMP, BALL, *walls
     kinds = {"kept": {"method": "directional"}, "still": {"method": "ray-traced", "sampling": "shared"}}
@@ -110,7 +109,7 @@ def test_light_of_emitters_bounces_as_along_paths(bounces):
     bounced = {}
     for name, settings in kinds.items():
         options = {"light": DARK, "visibility": ws.Visibility(**settings)}
-        bounced[name] = (image_of(*bodies, bounces=bounces, **options) - image_of(*bodies, **options)).mean()
+        bounced[name] = (image_of(*bodies, bounces="all", **options) - image_of(*bodies, **options)).mean()
     assert bounced["kept"] == pytest.approx(bounced["paths"], rel=KEPT_BOUNCED)
     assert bounced["still"] == pytest.approx(bounced["paths"], rel=BOUNCED)
 

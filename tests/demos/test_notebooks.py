@@ -29,7 +29,7 @@ FOUND = {
 
 FEWER_FACES = [("1, 65)", "1, 33)"), ("(1, 66, 65)", "(1, 34, 33)"), ("65 *", "33 *"), ("arange(64)", "arange(32)")]
 SMALLER = {
-    "error_against_time.ipynb": [("size=(128, 128)", "size=(64, 64)")],
+    "error_against_time.ipynb": [("size=(128, 128)", "size=(64, 64)"), ("samples=2048", "samples=512")],
     "pose.py": [("size=(96, 96)", "size=(64, 64)")],
     "relight_a_glb.ipynb": [("size=(192, 192)", "size=(64, 64)"), *FEWER_FACES],
     "relight_a_glb.py": [("size=(96, 96)", "size=(48, 48)"), (", 60)", ", 30)"), ("range(60)", "range(30)")],

@@ -140,17 +140,6 @@ def test_a_basin_has_panels_where_no_body_stands_behind_them(at, expected):
     assert (0 in blocking_parts(scene)) is expected
 
 
-@pytest.mark.slow
-def test_a_ball_at_the_bottom_of_a_basin_is_as_bright_as_by_rays():
-    camera = ws.Camera.look_at((0, 3.0, 2.6), (0.2, 0.1, 0.1), fov_y=14, size=(48, 48))
-    scene = ws.Scene([ws.Body(basin()), ball((0.2, 0.1, 0.1))], ws.EnvironmentMap.constant(), camera)
-    renderer = ws.Renderer(scene)
-    traced = ws.Renderer(dataclasses.replace(scene, visibility=ws.Visibility("ray-traced", samples=256)))
-    shows_ball = renderer.layers().bodies == 1
-    light, expected = (each.render()[shows_ball][:, :3].mean() for each in (renderer, traced))
-    assert light == pytest.approx(expected, rel=0.03)  # past panels 3.4% brighter
-
-
 def test_spheres_of_land_lie_where_it_is_seen():
     """Fitted to the whole solid, half of them cover its bottom, and gaps below the land are 1.5 times as deep."""
     mesh = land(24)
