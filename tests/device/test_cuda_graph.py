@@ -18,7 +18,7 @@ from warpshadow.device.constants import collected
 from warpshadow.device.cuda_graph import Captured, with_gradients
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline import node
-from warpshadow.pipeline.shading import method as method_module
+from warpshadow.pipeline.receivers import scene_receivers
 from warpshadow.pipeline.views import receiver_finder
 from warpshadow.stages import Poses
 from warpshadow.stages.textures.pyramid import mip_pyramids
@@ -300,7 +300,7 @@ def test_a_captured_fit_beside_static_bodies_has_the_loss_and_gradient_of_a_plai
         ball.turn.assign([np.multiply(shift, 2)])
         ball.translation.assign([shift])
         expected = [evaluate().numpy()[0], *(array.grad.numpy().copy() for array in (ball.turn, ball.translation))]
-        monkeypatch.setattr(method_module, "number_receivers", numbered.append)  # no more than once
+        monkeypatch.setattr(scene_receivers, "number_receivers", numbered.append)  # no more than once
         got = [step().numpy()[0], ball.turn.grad.numpy(), ball.translation.grad.numpy()]
         for one, other in zip(got, expected, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * np.abs(expected[2]).max())

@@ -62,6 +62,7 @@ from warpshadow.stages.self_visibility.trace import (
 )
 
 VERSION = 6  # part of the key of cached rows: raise it whenever they would come out differently
+FREE_SHAPE = "its shape is free"  # why a body of free shape blocks its own light, and that of others, by spheres
 
 
 Found = TypeVar("Found")
@@ -130,7 +131,7 @@ class SelfVisibility:
         if self._how(body) == "spheres":
             return 'self_shadows = "spheres"'
         if geometry is not None and body in geometry.deformed:
-            return "its shape is free"
+            return FREE_SHAPE
         if geometry is not None and geometry.rotations is None:
             return "geometry has no rotations; placed(…) makes one that has them"
         return ""

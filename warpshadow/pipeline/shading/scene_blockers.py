@@ -10,7 +10,7 @@ from warpshadow.pipeline.bodies.convex import SceneConvexParts
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.scene_planes import ScenePlanes
-from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
+from warpshadow.pipeline.bodies.self_visibility import FREE_SHAPE, SelfVisibility
 from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Blockers, BodySides
 from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
@@ -145,7 +145,10 @@ class SceneBlockers:
         of_its_own = f"and its own by {f'spheres: {why}' if why else 'rays, traced once'}"
         if body in kinds.convex:
             return f"{parts}, {of_its_own}"
-        spheres = f"as {self._merged_scene.sphere_counts[body]} spheres"
+        count = self._merged_scene.sphere_counts[body]
+        spheres = f"as {count} sphere{'s' * (count != 1)}"
+        if why == FREE_SHAPE:
+            return f"{spheres}, its own, too: {why}"
         return f"{spheres}{why_spheres_block(self._merged_scene.scene, body)}, {of_its_own}"
 
     def why_none_is_traced(self, kinds: BlockerKinds) -> str:
