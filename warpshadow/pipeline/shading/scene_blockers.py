@@ -145,7 +145,7 @@ class SceneBlockers:
         of_its_own = f"and its own by {f'spheres: {why}' if why else 'rays, traced once'}"
         if body in kinds.convex:
             return f"{parts}, {of_its_own}"
-        count = self._merged_scene.sphere_counts[body]
+        count = int(self._merged_scene.sphere_counts[body])
         spheres = f"as {count} sphere{'s' * (count != 1)}"
         if why == FREE_SHAPE:
             return f"{spheres}, its own, too: {why}"
