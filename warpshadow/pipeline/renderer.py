@@ -29,7 +29,7 @@ from warpshadow.pipeline.image_inputs import ImageArrays, takes
 from warpshadow.pipeline.methods.by_name import make_method
 from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.receivers.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
-from warpshadow.pipeline.receivers.lit_points import LitPoints
+from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.receivers.unevenness import NearLight
 from warpshadow.pipeline.shading.transfers import Light, join_rows
 from warpshadow.pipeline.transport import LightTransport
@@ -245,7 +245,7 @@ class SceneRenderer:
         return join_rows(view.transfers.value(self._views.call(view)))
 
     @announced
-    def shade(self, light: Light | None = None, view: LitPoints | None = None) -> wp.array:
+    def shade(self, light: Light | None = None, view: ShadingContext | None = None) -> wp.array:
         """Light the receivers of a view.
 
         Args:

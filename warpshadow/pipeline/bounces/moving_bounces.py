@@ -29,7 +29,7 @@ from warpshadow.pipeline.bounces.proxies import PlacedProxies, Proxies
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.node import Call, Node, NodeStage, identity
-from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
+from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.sphere_method import (
     LitPortion,
@@ -139,7 +139,7 @@ def _add_emitted(lit: list[PortionForBounces], emitted: wp.array) -> list[Portio
 class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
-    points: LitPoints
+    points: ShadingContext
     visibility: TransferForBounces | ShadingForBounces  # of the patch samples
     frames: Node  # of flat bodies
     placed_proxies: Node  # proxies of the patches, in the world
@@ -250,7 +250,7 @@ class MovingBounces:
         )
         self._proxies: dict[Senders, Proxies] = {}
 
-    def shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
+    def shading(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Node of the shading of points, direct and bounced, vec3 of shape [batch, receiver].
 
         Their visibility is cached where it holds for other calls: in free light, and where colors vary.
@@ -286,7 +286,7 @@ class MovingBounces:
         self,
         make_visibility: Callable[..., TransferForBounces | ShadingForBounces],
         proxies: Proxies,
-        points: LitPoints,
+        points: ShadingContext,
     ) -> PatchSampleNodes:
         """Nodes of the patch samples of the bodies around points."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres

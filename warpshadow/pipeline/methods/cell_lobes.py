@@ -7,7 +7,7 @@ import warp as wp
 
 from warpshadow.pipeline.methods.glossy_cells import CellMethod, shading_with_cells, transmittance_of_cells
 from warpshadow.pipeline.node import Node, field_of
-from warpshadow.pipeline.receivers.lit_points import receiver_text
+from warpshadow.pipeline.receivers.shading_context import receiver_text
 from warpshadow.pipeline.shading.lobe_light import LitLobes, LobeVisibility
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis

@@ -19,7 +19,7 @@ from warpshadow.pipeline.methods.glossy_cells import shading_with_cells
 from warpshadow.pipeline.methods.sharpest_cells import SharpestCells, find_share_of_sharpest_light, find_sharpest_cells
 from warpshadow.pipeline.node import Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, Group
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
+from warpshadow.pipeline.receivers.shading_context import BlockerKinds, ShadingContext
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells, project_on_cells
@@ -279,7 +279,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         """Visibility in lobes, between cells."""
         return CellLobes(self, self._directions)
 
-    def known_shading(self, points: LitPoints, light: LightInput) -> Node:
+    def known_shading(self, points: ShadingContext, light: LightInput) -> Node:
         """Direct known light on points; where no light bounces, with the cells of bodies that shine."""
         if self.merged_scene.scene.bounces or points.materials.roughness is None:
             return super().known_shading(points, light)

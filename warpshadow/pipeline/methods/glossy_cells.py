@@ -9,7 +9,7 @@ import warp as wp
 
 from warpshadow.pipeline.node import Call, Node
 from warpshadow.pipeline.receivers.groups import CellVisibility
-from warpshadow.pipeline.receivers.lit_points import LitPoints
+from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells
 from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, PortionedVisibility, SphereMethod
@@ -18,13 +18,13 @@ from warpshadow.pipeline.shading.transfers import join_portions, join_rows
 CellMethod = SphereMethod[ProjectedCells, CellVisibility]
 
 
-def shading_with_cells(method: CellMethod, points: LitPoints, light: LightInput) -> Node:
+def shading_with_cells(method: CellMethod, points: ShadingContext, light: LightInput) -> Node:
     """Node of the :class:`ShadingAndTransmittance` of points in known light that does not bounce."""
     make = functools.partial(_ShadingWithCells, method, points, method.projected_light(points, light), light)
     return method.cached_for_light("direct with cells", points, light, make)
 
 
-def transmittance_of_cells(method: CellMethod, points: LitPoints, light: LightInput) -> Node:
+def transmittance_of_cells(method: CellMethod, points: ShadingContext, light: LightInput) -> Node:
     """Node of the transmittance of points towards cells, float32 of shape [batch, receiver, direction]."""
     arguments = method, points, method.light_of_visibility(points, light), None
     make = functools.partial(_TransmittanceOfCells, *arguments, suffix=" of gloss")

@@ -15,7 +15,7 @@ from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLobes
 from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Group, HarmonicVisibility
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds
+from warpshadow.pipeline.receivers.shading_context import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.shell_patches import ShellPatches
 from warpshadow.pipeline.shading.sphere_method import SphereMethod

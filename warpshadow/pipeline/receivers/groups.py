@@ -17,7 +17,7 @@ from warpshadow.pipeline.bodies.convex import GroupConvexParts, SceneConvexParts
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.scene_planes import GroupPlanes, ScenePlanes
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds
+from warpshadow.pipeline.receivers.shading_context import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.stages.convex.convex_blockers import PlacedParts
 from warpshadow.stages.light.cached_cells import CachedRows
@@ -291,7 +291,7 @@ def find_portions(
         self_lookups: Self-visibility of receivers, by body; None without any.
         cached_rows: Cached transmittance past static bodies, for receivers on them.
         static_normals: Normals of all vertices of static bodies; None where any may move.
-        static_bodies, nearest_spheres: As of the :class:`LitPoints` that they are.
+        static_bodies, nearest_spheres: As of the :class:`ShadingContext` that they are.
     """
     if static_bodies is not None and len(receivers.static_vertices):
         assert static_normals is not None

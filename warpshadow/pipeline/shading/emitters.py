@@ -21,7 +21,7 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Clock, Node
-from warpshadow.pipeline.receivers.lit_points import LitPoints
+from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.stages.bounces.albedo import mean_over_texels
 from warpshadow.stages.emitters.beams import find_axis_weights, weigh_by_beam
 from warpshadow.stages.emitters.emitter_self_visibility import EmitterSelfVisibility, find_self_visibility
@@ -158,7 +158,7 @@ class SceneEmitters:
             total += light.numpy()[0] @ LUMINANCE
         return total
 
-    def samples_node(self, points: LitPoints) -> Node:
+    def samples_node(self, points: ShadingContext) -> Node:
         """Node of the samples among the bodies around points."""
         return points.cached_of_bodies("emitters", None, lambda: Node("", self._place, points.vertices))
 

@@ -16,7 +16,7 @@ from warpshadow.device.batch import rows
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node, field_of
-from warpshadow.pipeline.receivers.lit_points import receiver_text
+from warpshadow.pipeline.receivers.shading_context import receiver_text
 from warpshadow.pipeline.shading.glossy_points import GlossyPoints
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.lobe_light import LitLobes

@@ -7,8 +7,8 @@ import warp as wp
 
 from warpshadow.device.constants import gather_of_owners
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.receivers.lit_points import AdaptiveSurfaces, BlockerKinds
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
+from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.image.slopes import find_mean_slopes

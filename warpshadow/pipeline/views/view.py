@@ -9,8 +9,8 @@ import warp as wp
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.bodies.reflectance import Materials, SampleReflectance
 from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, field_of, identity
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
+from warpshadow.pipeline.receivers.shading_context import BlockerKinds, ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.transport import LightTransport
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from warpshadow.stages.image.photograph import RatioImage
 
 
-class View(LitPoints):
+class View(ShadingContext):
     """A geometry seen by cameras: all inputs of an image except light and given reflectance.
 
     Args:
@@ -49,7 +49,7 @@ class View(LitPoints):
         call: Holds its values that may not be cached.
         camera: Has the cameras' size and near plane.
         counts: Number of geometries, and of images.
-        is_scene_view: As for :class:`LitPoints`.
+        is_scene_view: As for :class:`ShadingContext`.
     Attributes:
         dependencies: Vertices, spheres, cameras, static bodies, and how all block light.
         clip_positions, fragments_node, silhouettes, receivers_node: Nodes of the visible surfaces.
