@@ -33,10 +33,10 @@ from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiv
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.sphere_method import (
     LitPortion,
-    PortionedShading,
-    PortionedTransfer,
     ProjectedLight,
+    ShadingNode,
     SphereMethod,
+    TransferNode,
 )
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.scene.scene import Bounces
@@ -47,7 +47,7 @@ from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.receivers.find import Receivers
 
 
-class TransferForBounces(PortionedTransfer):
+class TransferForBounces(TransferNode):
     """Receivers in free light, a list of :class:`PortionForBounces`: transfer vectors, and transmittance of cells."""
 
     def result_of(self, portion: LitPortion) -> PortionForBounces:
@@ -55,7 +55,7 @@ class TransferForBounces(PortionedTransfer):
         return _portion_for_bounces(self.method, portion)
 
 
-class ShadingForBounces(PortionedShading):
+class ShadingForBounces(ShadingNode):
     """Receivers in known light, a list of :class:`PortionForBounces`: direct light, and transmittance of cells."""
 
     def compute(self, call: Call) -> Any:
@@ -72,7 +72,7 @@ def _portion_for_bounces(method: SphereMethod, portion: LitPortion) -> PortionFo
     return PortionForBounces(portion.result, portion.group, transmittance)
 
 
-class PortionedDirectLight(Node):
+class DirectLightNode(Node):
     """Direct light, in portions.
 
     Args:
@@ -207,7 +207,7 @@ class Radiosity(Node):
         )
 
 
-class BouncedShading(PortionedDirectLight):
+class BouncedShading(DirectLightNode):
     """Shading of receivers, direct and bounced.
 
     Args:
@@ -263,7 +263,7 @@ class MovingBounces:
         method, senders = self._method, self._patches.senders(materials)
         projected_light = method.projected_light(points, light)
         if not senders.bodies:
-            direct = PortionedShading(method, points, projected_light, light)
+            direct = ShadingNode(method, points, projected_light, light)
             return Node("bounces", identity, direct, idle="every body is black")
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
         make_visibility = functools.partial(
@@ -310,7 +310,7 @@ class MovingBounces:
         arguments = f"{len(senders.sides):,} patch samples", OF_PATCH_SAMPLES
         lit: Node = patch_samples.visibility
         if free_light is not None:
-            lit = PortionedDirectLight(patch_samples.visibility, free_light, *arguments)
+            lit = DirectLightNode(patch_samples.visibility, free_light, *arguments)
         if materials.emission:
             lit = Node("", _add_emitted, lit, self._method.light_of_emitters(patch_samples.points, materials))
         albedo = self._patches.albedo(materials, senders.bodies)

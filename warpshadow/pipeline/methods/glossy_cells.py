@@ -12,7 +12,7 @@ from warpshadow.pipeline.receivers.groups import CellVisibility
 from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells
-from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, PortionedVisibility, SphereMethod
+from warpshadow.pipeline.shading.sphere_method import LitPortion, ShadingNode, SphereMethod, VisibilityNode
 from warpshadow.pipeline.shading.transfers import join_portions, join_rows
 
 CellMethod = SphereMethod[ProjectedCells, CellVisibility]
@@ -38,7 +38,7 @@ class ShadingAndTransmittance(NamedTuple):
     transmittance: wp.array  # of receivers on bodies that shine, float32 of shape [batch, receiver, direction]
 
 
-class _ShadingWithCells(PortionedShading):
+class _ShadingWithCells(ShadingNode):
     """Shading of receivers, and the transmittance of cells at bodies that shine."""
 
     def compute(self, call: Call) -> ShadingAndTransmittance:
@@ -54,7 +54,7 @@ class _ShadingWithCells(PortionedShading):
         return portion.result, _transmittance_of(portion) if is_glossy else None
 
 
-class _TransmittanceOfCells(PortionedVisibility):
+class _TransmittanceOfCells(VisibilityNode):
     """Transmittance of receivers towards cells, float32 of shape [batch, receiver, direction]."""
 
     def compute(self, call: Call) -> wp.array:

@@ -185,11 +185,7 @@ class RayTraced(Method):
         for instance, (result, tree, origins, normals, own_shell) in enumerate(_instances(*batches)):
             arguments, options = (tree, origins, normals), {"shell": own_shell}
             # a ratio image has the same directions with the bodies and without
-            pilots = (
-                None
-                if self.merged_scene.scene.catchers
-                else functools.partial(find_shares, *arguments, **options)
-            )
+            pilots = None if self.merged_scene.scene.catchers else functools.partial(find_shares, *arguments, **options)
             samples = cut_map(light.radiance, count, pilots)
             corners = None
             if receivers.fragments.face_ids.ndim == 3:  # of an image

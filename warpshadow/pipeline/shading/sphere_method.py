@@ -66,8 +66,8 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     | :attr:`emitter_cells` | lamps, past the self-visibility of receivers | None: without it |
     | :meth:`share_of_sharpest_light` | adaptive receivers | None, as where nothing blocks |
 
-    :class:`PortionedVisibility` calls find_visibility, then find_visibility_past_planes; :class:`PortionedTransfer`
-    goes on with transfer, and :class:`PortionedShading` with that and shade_transfer, or with shade_transmittance.
+    :class:`VisibilityNode` calls find_visibility, then find_visibility_past_planes; :class:`TransferNode`
+    goes on with transfer, and :class:`ShadingNode` with that and shade_transfer, or with shade_transmittance.
 
     Attributes:
         free_basis: The basis in which the method projects any free light, of the scene's shell if it has one.
@@ -235,12 +235,12 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
 
     def known_shading(self, points: ShadingContext, light: LightInput) -> Node:
         """Direct known light on points."""
-        return PortionedShading(self, points, self.projected_light(points, light), light)
+        return ShadingNode(self, points, self.projected_light(points, light), light)
 
     def openness(self, points: ShadingContext) -> Node:
         """Light that points reflect as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
         sky = LightInput(EnvironmentMap.constant(1.0))
-        return PortionedShading(self, points, Node("", self.project_light, sky), sky, suffix=" in an even sky")
+        return ShadingNode(self, points, Node("", self.project_light, sky), sky, suffix=" in an even sky")
 
     def transfers(self, points: ShadingContext, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`; where they require a gradient, to the method's native basis.
@@ -248,7 +248,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         The product with the matrix between both is NumPy's; :meth:`_free_shading` converts the light instead.
         """
         matrix, visibility_light = self.native_from_basis, self.free_basis_of(points, shell)
-        transfers = PortionedTransfer(self, points, visibility_light, None, caches=matrix is None)
+        transfers = TransferNode(self, points, visibility_light, None, caches=matrix is None)
         if matrix is None or transfers.requires_grad:
             return transfers
 
@@ -267,7 +267,7 @@ class LitPortion(NamedTuple):
     result: Any = None  # of the step after visibility: transfer vectors, or shading
 
 
-class PortionedVisibility(Node):
+class VisibilityNode(Node):
     """Visibility of receivers, found group by group and portion by portion; classes below add steps.
 
     Each step is a function of the method. The value is a list of the results of all portions. Without a gradient,
@@ -367,7 +367,7 @@ class PortionedVisibility(Node):
         return portion.result
 
 
-class PortionedTransfer(PortionedVisibility):
+class TransferNode(VisibilityNode):
     """Transfer vectors of receivers."""
 
     step_count = 3
@@ -380,7 +380,7 @@ class PortionedTransfer(PortionedVisibility):
             return portion._replace(result=self.method.transfer(portion.visibility, portion.group, projected_light))
 
 
-class PortionedShading(PortionedTransfer):
+class ShadingNode(TransferNode):
     """Shading of receivers, vec3 of shape [batch, receiver]."""
 
     step_count = 4
