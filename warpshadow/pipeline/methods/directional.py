@@ -24,7 +24,7 @@ from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells, project_on_cells
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
-from warpshadow.pipeline.shading.shell_patches import PATCHES, ShellPatches, project_on_shell
+from warpshadow.pipeline.shading.shell_cells import SHELL_BASIS, ShellCells, project_on_shell
 from warpshadow.pipeline.shading.sphere_method import SphereMethod
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT
 from warpshadow.scene.blockers import blocking_planes
@@ -52,11 +52,11 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
         self._directions = fibonacci(merged_scene.scene.direction_count)
         is_near = merged_scene.scene.shell is not None
-        native_basis = PATCHES if is_near else CellBasis(self._directions)
+        native_basis = SHELL_BASIS if is_near else CellBasis(self._directions)
         super().__init__(merged_scene, native_basis, basis, progress=progress)
         self.widens_edges = not is_near
         self.free_basis = ProjectedCells(
-            self._directions, patches=None if self.shell is None else ShellPatches(self.shell)
+            self._directions, shell_cells=None if self.shell is None else ShellCells(self.shell)
         )
 
     def project_light(self, light: KnownLight, shell: wp.array | None = None) -> ProjectedCells:
@@ -65,8 +65,8 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         From a shell light comes to each receiver from other directions: cells are even.
         """
         if shell is not None:
-            patches, radiance = project_on_shell(light, shell)
-            return self.free_basis._replace(patches=patches, coefficients=radiance)
+            shell_cells, radiance = project_on_shell(light, shell)
+            return self.free_basis._replace(shell_cells=shell_cells, coefficients=radiance)
         blockers = self.scene_blockers
         return project_on_cells(
             light,
@@ -79,7 +79,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def free_basis_of_shell(self, shell: wp.array) -> ProjectedCells:
         """The basis of free light of another shell than the scene's. Differentiable: shell."""
-        return self.free_basis._replace(patches=ShellPatches(shell))
+        return self.free_basis._replace(shell_cells=ShellCells(shell))
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of coefficients that take part: all."""
@@ -234,9 +234,9 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     def transfer(self, visibility: CellVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Transfer vectors; the transmittance as it is where cached cells hold known light."""
         assert visibility.transmittance_total is not None
-        if projected_light.patches is not None:
+        if projected_light.shell_cells is not None:
             arguments = group.points, group.normals, visibility.transmittance_total, projected_light.blocking_directions
-            return projected_light.patches.transfer(*arguments)
+            return projected_light.shell_cells.transfer(*arguments)
         if group.cached_rows is None:
             return directional_transfer(
                 visibility.transmittance_total, group.normals, projected_light.cosine_directions
@@ -255,7 +255,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         self, visibility: CellVisibility, group: Group, projected_light: ProjectedCells
     ) -> wp.array:
         """Shading of a group in known light."""
-        if group.cached_rows is not None or projected_light.patches is not None:
+        if group.cached_rows is not None or projected_light.shell_cells is not None:
             return super().shade_transmittance(visibility, group, projected_light)
         assert visibility.transmittance_total is not None and projected_light.coefficients is not None
         cells = projected_light.cosine_directions, projected_light.coefficients

@@ -17,7 +17,7 @@ from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Group, HarmonicVisibility
 from warpshadow.pipeline.receivers.shading_context import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
-from warpshadow.pipeline.shading.shell_patches import ShellPatches
+from warpshadow.pipeline.shading.shell_cells import ShellCells
 from warpshadow.pipeline.shading.sphere_method import SphereMethod
 from warpshadow.stages.light.cached_cells import add_rows
 from warpshadow.stages.light.transfer import sh_product, sh_transfer
@@ -25,11 +25,11 @@ from warpshadow.stages.visibility import exponential, log_sh
 
 
 class ProjectedBands(NamedTuple):
-    """Light in bands of spherical harmonics; or in patches of a shell, which the method "none" has."""
+    """Light in bands of spherical harmonics; or in cells of a shell, which the method "none" has."""
 
-    bands: int  # 0 of patches
+    bands: int  # 0 of cells of a shell
     coefficients: wp.array | None = None  # of known light, vec3 of shape [1, bands²], or [1, patch]
-    patches: ShellPatches | None = None  # that send the light, whose coefficients are theirs; None where it is far
+    shell_cells: ShellCells | None = None  # that send the light, whose coefficients are theirs; None where it is far
 
     def with_coefficients(self, coefficients: wp.array) -> "ProjectedBands":
         """Light of the same basis."""
