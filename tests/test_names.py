@@ -125,6 +125,21 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[str, int]]:
                 yield value.value.strip(), child.lineno
 
 
+def types_in(tree: ast.Module) -> Iterator[str]:
+    """Names of classes, and of a module's type aliases: words that begin with a capital letter, but type variables."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+            is_variable = isinstance(node.value, ast.Call) and getattr(node.value.func, "id", "") == "TypeVar"
+            if (
+                isinstance(target, ast.Name)
+                and re.match("[A-Z][A-Za-z0-9]*[a-z]|[A-Z]$", target.id)
+                and not is_variable
+            ):
+                yield target.id
+    yield from (node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+
+
 CLASSES = {node.name: node for _, tree in trees() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
 
 
@@ -154,9 +169,14 @@ def documented_arguments(docstring: str) -> Iterator[str]:
             yield from (name.strip(" *") for name in line.partition(":")[0].split(","))
 
 
-def test_no_two_classes_have_one_name():
-    counts = Counter(node.name for _, tree in trees() for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+def test_no_two_classes_or_type_aliases_have_one_name():
+    counts = Counter(name for _, tree in trees() for name in types_in(tree))
     assert len(counts) > 200 and not [name for name, count in counts.items() if count > 1]
+
+
+def test_types_are_classes_and_aliases():
+    tree = ast.parse("A: TypeAlias = int\nB = TypeVar()\nC = Union[int, str]\nd = 1\nclass E: pass\nE_MAX = F[0] = 2")
+    assert list(types_in(tree)) == ["A", "C", "E"]
 
 
 def test_no_two_files_of_stages_have_public_functions_of_one_name():

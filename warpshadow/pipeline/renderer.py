@@ -31,7 +31,7 @@ from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.receivers.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
 from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.receivers.unevenness import NearLight
-from warpshadow.pipeline.shading.transfers import Light, join_rows
+from warpshadow.pipeline.shading.transfers import LightArgument, join_rows
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.catchers import CatchersAlone
 from warpshadow.pipeline.views.layers import LayerArrays, Layers, find_layer_arrays, find_layers
@@ -245,7 +245,7 @@ class SceneRenderer:
         return join_rows(view.transfers.value(self._views.call(view)))
 
     @announced
-    def shade(self, light: Light | None = None, view: ShadingContext | None = None) -> wp.array:
+    def shade(self, light: LightArgument | None = None, view: ShadingContext | None = None) -> wp.array:
         """Light the receivers of a view.
 
         Args:

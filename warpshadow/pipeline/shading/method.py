@@ -25,7 +25,7 @@ from warpshadow.pipeline.receivers.shading_context import (
     receiver_text,
 )
 from warpshadow.pipeline.shading.light_input import LightInput
-from warpshadow.pipeline.shading.transfers import Light, check_light, shade_free
+from warpshadow.pipeline.shading.transfers import LightArgument, check_light, shade_free
 from warpshadow.stages.receivers.quadtree import Quadtree
 from warpshadow.stages.shell.beams import check_shell, shell_array
 
@@ -121,7 +121,9 @@ class Method(abc.ABC):
             cameras: Clip matrices.
         """
 
-    def light_input(self, points: ShadingContext, light: Light | None, shell: wp.array | None = None) -> LightInput:
+    def light_input(
+        self, points: ShadingContext, light: LightArgument | None, shell: wp.array | None = None
+    ) -> LightInput:
         """The light of an image, or of other points, as an input, checked; the same for the same known light and shell.
 
         Args:
@@ -141,7 +143,7 @@ class Method(abc.ABC):
         why_new = "" if points.last_cached("light") is None else "light changed since the last call"
         return points.cached("light", (known, shell_input), lambda: LightInput(known, shell_input, why_new=why_new))
 
-    def _shell_input(self, points: ShadingContext, light: Light | None, shell: wp.array | None) -> Input | None:
+    def _shell_input(self, points: ShadingContext, light: LightArgument | None, shell: wp.array | None) -> Input | None:
         """The shell of light that is not the scene's, the same while its values are; None for the scene's."""
         if isinstance(light, EnvironmentMap) and light.shell is not None and shell is None:
             shell = shell_array(light.shell, self.merged_scene.device)
