@@ -16,7 +16,7 @@ from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
 from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.bounces.proxies import PlacedProxies, Proxies
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
-from warpshadow.pipeline.node import Call, Node, NodeStage
+from warpshadow.pipeline.node import Call, ExplainRow, Node
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.scene.visibility import Visibility
 from warpshadow.stages.bounces.overlays import overlaid_radiosity
@@ -126,7 +126,7 @@ class Gathering:
         )
         names = "self light", "plane light", "sphere light"
         stages = tuple(
-            NodeStage(f"{name}{suffix}", item_text, why_not or why) for name, why in zip(names, idle, strict=True)
+            ExplainRow(f"{name}{suffix}", item_text, why_not or why) for name, why in zip(names, idle, strict=True)
         )
         functions = self._from_itself, self._from_planes, self._from_spheres
         first = 1 if only_others else 0

@@ -28,7 +28,7 @@ from warpshadow.pipeline.bounces.patches import OF_PATCH_SAMPLES, ScenePatches, 
 from warpshadow.pipeline.bounces.proxies import PlacedProxies, Proxies
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
-from warpshadow.pipeline.node import Call, Node, NodeStage, identity
+from warpshadow.pipeline.node import Call, ExplainRow, Node, identity
 from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.sphere_method import (
@@ -91,11 +91,11 @@ class DirectLightNode(Node):
         item_text: str | Callable[[], str],
         suffix: str = "",
         others: tuple[Node | None, ...] = (),
-        stages: tuple[NodeStage, ...] = (),
+        stages: tuple[ExplainRow, ...] = (),
     ):
         self._visibility = visibility
         if free_light is not None:
-            self._shading = NodeStage(f"shading{suffix}", item_text, inputs=(visibility, free_light))
+            self._shading = ExplainRow(f"shading{suffix}", item_text, inputs=(visibility, free_light))
             stages = self._shading, *stages
         super().__init__("", None, free_light, *others, extra_inputs=(visibility,), stages=stages)
 
@@ -164,8 +164,8 @@ class Radiosity(Node):
         self._self_form_factors, self._gathering = self_form_factors, gathering
         item_text = f"{len(senders.areas):,} patches"
         idle = ALL_FLAT if all(senders.merged_scene.is_flat[body] for body in senders.bodies) else ""
-        self._reflection = NodeStage("radiosity", item_text)
-        self._self_reflection = NodeStage("self light of patches", item_text, idle)
+        self._reflection = ExplainRow("radiosity", item_text)
+        self._self_reflection = ExplainRow("self light of patches", item_text, idle)
         stages = self._reflection, self._self_reflection, *gathering.stages
         super().__init__("", None, lit, albedo, placed_proxies, frames, weights, stages=stages)
 

@@ -11,7 +11,7 @@ from warpshadow.assets.basis import Basis, CellBasis, HarmonicBasis
 from warpshadow.assets.known_light import KnownLight
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
-from warpshadow.pipeline.node import Input, Node, NodeStage, detached
+from warpshadow.pipeline.node import ExplainRow, Input, Node, detached
 from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.lobe_light import LitLobes, LobeVisibility
@@ -54,7 +54,7 @@ class RayTraced(Method):
             light,
             self.shell_of(light),
             items=functools.partial(receiver_text, points.weak),
-            stages=(NodeStage("transfer", idle="rays shade known light at once"),),
+            stages=(ExplainRow("transfer", idle="rays shade known light at once"),),
         )
 
     def along_paths(self, direct: Node, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
@@ -149,7 +149,7 @@ class RayTraced(Method):
                 items=lambda: f"{receiver_text(weak_points)} by rays",
                 idle="" if self.merged_scene.casting else "no body has blockers",
                 caches=False,
-                stages=(NodeStage("static shadows", idle="rays treat all receivers alike"),),
+                stages=(ExplainRow("static shadows", idle="rays treat all receivers alike"),),
             )
 
         return points.cached("meshes", None, meshes)

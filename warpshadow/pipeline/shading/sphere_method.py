@@ -14,7 +14,7 @@ from warpshadow.device.constants import Identity
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
-from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached
+from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached
 from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_portions
 from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, BlockerKinds, ShadingContext, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
@@ -299,22 +299,22 @@ class VisibilityNode(Node):
         self._progress, weak_points = method.progress and light is not None, points.weak
         suffix, planes = points.suffix if suffix is None else suffix, points.blocker_kinds.planes
         item_text = functools.partial(receiver_text, weak_points)
-        self._visibility = NodeStage(
+        self._visibility = ExplainRow(
             f"visibility{suffix}",
             lambda: method.scene_blockers.pairs_with(weak_points),
             lambda: _why_unblocked(method, weak_points),
         )
-        self._planes = NodeStage(
+        self._planes = ExplainRow(
             f"planes{suffix}",
             lambda: f"{item_text()} × {len(planes)} flat {'body' if len(planes) == 1 else 'bodies'}",
             "" if planes else "spheres stand in for the bodies that cast shadows",
         )
-        self._transfer = NodeStage(
+        self._transfer = ExplainRow(
             f"transfer{suffix}",
             lambda: f"{item_text()} × {method.coefficient_count(light)} coefficients",
             "" if self.needs_transfer else "shading takes transmittance at once",
         )
-        self._shading = NodeStage(f"shading{suffix}", item_text)
+        self._shading = ExplainRow(f"shading{suffix}", item_text)
         steps = self._visibility, self._planes, self._transfer, self._shading
         super().__init__(
             "",

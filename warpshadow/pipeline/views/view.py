@@ -8,7 +8,7 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.bodies.reflectance import Materials, SampleReflectance
-from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, field_of, identity
+from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached, field_of, identity
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
 from warpshadow.pipeline.receivers.shading_context import BlockerKinds, ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
@@ -144,7 +144,7 @@ class View(ShadingContext):
         shading, reflectance = self.shading(light, materials), self._moving_reflectance(materials)
         shines = materials.roughness or materials.emission
         if not shines and reflectance.pyramids.requires_grad and not (shading.requires_grad or clip.requires_grad):
-            replaced_stages = (NodeStage("reflectance", idle="found with the radiance"),)
+            replaced_stages = (ExplainRow("reflectance", idle="found with the radiance"),)
             reflectance_inputs = reflectance.vertex_albedo, reflectance.pyramids, reflectance.footprints
             arguments = fragments, self.merged_scene.faces, *reflectance_inputs, self._white_radiance_of(shading)
             samples = Node(
