@@ -269,7 +269,7 @@ class MovingBounces:
         make_visibility = functools.partial(
             TransferForBounces if light.is_free else ShadingForBounces,
             method,
-            projected_light=method.light_of_visibility(points, light),
+            projected_light=method.visibility_basis(points, light),
             light=light,
         )
         free_light = projected_light if light.is_free else None

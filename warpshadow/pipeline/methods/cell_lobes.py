@@ -37,7 +37,7 @@ class CellLobes(LobeVisibility):
         In known light that does not bounce the shading of the view has found it.
         """
         points, light = lobes.points, lobes.light
-        visibility_light = self._method.light_of_visibility(points, light)
+        visibility_light = self._method.visibility_basis(points, light)
         if light.is_free or self._merged_scene.scene.bounces:
             transmittance = transmittance_of_cells(self._method, points, light)
         else:

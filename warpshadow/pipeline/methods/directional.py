@@ -47,14 +47,14 @@ from warpshadow.stages.visibility.sharp_cells import RADII_PER_HALF_ANGLE, Sharp
 class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     """Visibility for each cell of directions by itself."""
 
-    shades_transmittance = True
+    shades_without_transfer = True
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
         self._directions = fibonacci(merged_scene.scene.direction_count)
         is_near = merged_scene.scene.shell is not None
         native_basis = SHELL_BASIS if is_near else CellBasis(self._directions)
         super().__init__(merged_scene, native_basis, basis, progress=progress)
-        self.widens_edges = not is_near
+        self.edges_as_wide_as_footprints = not is_near
         self.free_basis = ProjectedCells(
             self._directions, shell_cells=None if self.shell is None else ShellCells(self.shell)
         )

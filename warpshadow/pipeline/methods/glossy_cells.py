@@ -26,7 +26,7 @@ def shading_with_cells(method: CellMethod, points: ShadingContext, light: LightI
 
 def transmittance_of_cells(method: CellMethod, points: ShadingContext, light: LightInput) -> Node:
     """Node of the transmittance of points towards cells, float32 of shape [batch, receiver, direction]."""
-    arguments = method, points, method.light_of_visibility(points, light), None
+    arguments = method, points, method.visibility_basis(points, light), None
     make = functools.partial(_TransmittanceOfCells, *arguments, suffix=" of gloss")
     return points.cached("cells", light.visibility_key, make)
 

@@ -73,14 +73,14 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         free_basis: The basis in which the method projects any free light, of the scene's shell if it has one.
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         adds_cached_rows: Whether visibility combines cached rows with moving blockers.
-        shades_transmittance: Whether known light is summed from transmittance directly (:meth:`shade_transmittance`).
+        shades_without_transfer: Whether known light is summed from transmittance directly (:meth:`shade_transmittance`).
             No transfer vectors are then stored, but for cached rows and light from a shell.
     """
 
     free_basis: Projected
     why_no_shadows = ""
     adds_cached_rows = False
-    shades_transmittance = False
+    shades_without_transfer = False
 
     @property
     def emitter_cells(self) -> Projected | None:
@@ -127,13 +127,13 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     def projected_light(self, points: ShadingContext, light: LightInput) -> Node:
         """Node of light on points, projected for the method; the same for the same known light."""
         if light.is_free:
-            return Node("", self._with_free_light, light, self.light_of_visibility(points, light))
+            return Node("", self._with_free_light, light, self.visibility_basis(points, light))
         if light is self.light:
             return self._projected_scene_light
         make = functools.partial(Node, "", self.project_light, light, self.shell_of(light))
         return points.cached_of_bodies("projected", light, make)
 
-    def light_of_visibility(self, points: ShadingContext, light: LightInput) -> Node | Projected:
+    def visibility_basis(self, points: ShadingContext, light: LightInput) -> Node | Projected:
         """The light by which visibility is found, projected: known light, or any free light of the same shell."""
         return self.free_basis_of(points, light.shell) if light.is_free else self.projected_light(points, light)
 
@@ -388,7 +388,7 @@ class ShadingNode(TransferNode):
     @property
     def needs_transfer(self) -> bool:
         """Whether the method shades by transfer vectors."""
-        return not self.method.shades_transmittance
+        return not self.method.shades_without_transfer
 
     def compute(self, call: Call) -> Any:
         """Shade all portions."""
