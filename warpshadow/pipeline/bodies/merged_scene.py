@@ -19,7 +19,7 @@ from warpshadow.pipeline.bodies.geometry import CENTER, Geometry, Pivot, as_geom
 from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.scene.visibility import AUTO
-from warpshadow.spheres import MANY, Spheres
+from warpshadow.spheres import SHADOW_SPHERES, Spheres
 from warpshadow.stages.geometry.poses import Poses
 
 if TYPE_CHECKING:  # it is imported where a body emits
@@ -233,7 +233,7 @@ class MergedScene:
             return np.diff(self.first_sphere)
         if not self.scene.visibility.traits.has_spheres:
             return np.zeros(len(self.scene.bodies), int)
-        blockers = (MANY if body.blockers == AUTO else body.blockers for body in self.scene.bodies)
+        blockers = (SHADOW_SPHERES if body.blockers == AUTO else body.blockers for body in self.scene.bodies)
         return np.array([len(spheres) if isinstance(spheres, Spheres) else spheres for spheres in blockers])
 
     @functools.cached_property
