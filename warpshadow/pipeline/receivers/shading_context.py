@@ -54,6 +54,14 @@ class AdaptiveSurfaces(NamedTuple):
     footprints_of: Callable[[Fragments, tuple[int, int]], wp.array]
 
 
+class ReceiverCount(NamedTuple):
+    """Number of receivers."""
+
+    moving: int  # those on bodies that may move
+    static: int
+    is_bound: bool = False  # whether there may be fewer that move
+
+
 ONLY_SPHERES = BlockerKinds()  # all bodies block by their spheres
 
 
@@ -148,10 +156,10 @@ class ShadingContext:
         """Where light is evaluated."""
         return self.receivers_node.value(self.call)
 
-    def counts(self) -> tuple[str, int, int]:
-        """How many receivers may move and how many are static; "up to " where they are not found yet."""
+    def counts(self) -> ReceiverCount:
+        """How many receivers may move and how many are static; at most so many where they are not found yet."""
         receivers = self.receivers
-        return "", receivers.points.size, len(receivers.static_vertices)
+        return ReceiverCount(receivers.points.size, len(receivers.static_vertices))
 
 
 def _cached(values: dict[str, tuple[Hashable, Any]], name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
@@ -162,5 +170,5 @@ def _cached(values: dict[str, tuple[Hashable, Any]], name: str, key: Hashable, m
 
 def receiver_text(points: ShadingContext, *, moving: bool = True, static: bool = True) -> str:
     """Number of receivers, in words."""
-    up_to, moving_count, static_count = points.counts()
-    return f"{up_to}{moving * moving_count + static * static_count:,} receivers"
+    count = points.counts()
+    return f"{'up to ' * count.is_bound}{moving * count.moving + static * count.static:,} receivers"

@@ -418,7 +418,7 @@ def _why_unblocked(method: SphereMethod, points: ShadingContext) -> str:
     blockers, kinds, static_bodies = method.scene_blockers, points.blocker_kinds, points.static_bodies
     if not blockers.has_any(kinds):
         return f"no body {'but flat ones ' if kinds.planes else ''}has blockers"
-    _, moving, static = points.counts()
+    moving, static, _ = points.counts()
     blocks_static = static_bodies and (method.adds_cached_rows or blockers.has_any(kinds, static_bodies.moving))
     if moving or (static and blocks_static):
         return ""

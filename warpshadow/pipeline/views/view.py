@@ -10,7 +10,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.bodies.reflectance import Materials, SampleReflectance
 from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached, field_of, identity
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
-from warpshadow.pipeline.receivers.shading_context import BlockerKinds, ShadingContext, receiver_text
+from warpshadow.pipeline.receivers.shading_context import BlockerKinds, ReceiverCount, ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.transport import LightTransport
@@ -347,15 +347,15 @@ class View(ShadingContext):
         """Fragment of each sample."""
         return self.fragments_node.value(self.call)
 
-    def counts(self) -> tuple[str, int, int]:
-        """How many receivers may move and how many are static; "up to " where they are not found yet."""
+    def counts(self) -> ReceiverCount:
+        """How many receivers may move and how many are static; at most so many where they are not found yet."""
         if self.receivers_node.value_if_known(self.call) is not None:
             return super().counts()
         at_vertices, static = self._scene_receivers.at_vertices(self.blocker_kinds), 0
         if self.static_bodies is not None:
             static = int((at_vertices & self.static_bodies.has_vertex).sum())
         samples = self._sample_count * self._scene_receivers.at_samples(self.blocker_kinds).any()
-        return "up to ", int(self._pose_count * (at_vertices.sum() - static) + samples), static
+        return ReceiverCount(int(self._pose_count * (at_vertices.sum() - static) + samples), static, is_bound=True)
 
     def _vertices(self) -> str:
         count, static = int(self.merged_scene.first_vertex[-1]), 0
