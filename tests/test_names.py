@@ -133,12 +133,9 @@ def types_in(tree: ast.Module) -> Iterator[str]:
     for node in tree.body:
         if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
             target = node.targets[0] if isinstance(node, ast.Assign) else node.target
-            is_variable = isinstance(node.value, ast.Call) and getattr(node.value.func, "id", "") == "TypeVar"
-            if (
-                isinstance(target, ast.Name)
-                and re.match("[A-Z][A-Za-z0-9]*[a-z]|[A-Z]$", target.id)
-                and not is_variable
-            ):
+            maker = getattr(getattr(node.value, "func", None), "id", "")
+            is_type = isinstance(target, ast.Name) and re.match("[A-Z][A-Za-z0-9]*[a-z]|[A-Z]$", target.id)
+            if is_type and maker not in ("TypeVar", "ParamSpec"):
                 yield target.id
     yield from (node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
 

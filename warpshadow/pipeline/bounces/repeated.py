@@ -27,8 +27,8 @@ def after_bounces(
 
     Args:
         bounces: How often light bounces.
-        by_others: Function of the radiosity B, None before the first bounce: the light of patches that is not from their
-            own body, so from the sky and from other bodies. Only ``add_by_self`` reads its result.
+        by_others: Function of the radiosity B, None before the first bounce: the light of patches that is not from
+            their own body, so from the sky and from other bodies. Only ``add_by_self`` reads its result.
         add_by_self: Function of that light and of B: adds the light from their own body, none for None, and returns the
             next radiosity.
         areas: Of patches, shape [patch].

@@ -62,9 +62,7 @@ class Method(abc.ABC):
         basis: Basis of free light; None for the method's own.
     """
 
-    edges_as_wide_as_footprints = (
-        False  # whether edges of a sun's shadow on flat bodies are as wide as receivers' footprints
-    )
+    edges_as_wide_as_footprints = False  # edges of a sun's shadow on flat bodies are as wide as receivers' footprints
 
     shares_directions = False
     """Whether all receivers look for light in the same directions, so that one is enough for a surface in a pixel."""

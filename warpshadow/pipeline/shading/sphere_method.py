@@ -73,7 +73,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         free_basis: The basis in which the method projects any free light, of the scene's shell if it has one.
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         adds_cached_rows: Whether visibility combines cached rows with moving blockers.
-        shades_without_transfer: Whether known light is summed from transmittance directly (:meth:`shade_transmittance`).
+        shades_without_transfer: Whether known light is summed from transmittance directly, :meth:`shade_transmittance`.
             No transfer vectors are then stored, but for cached rows and light from a shell.
     """
 
