@@ -24,7 +24,7 @@ from warpshadow.pipeline.views.view import View
 from warpshadow.rendering.renderer import Renderer
 from warpshadow.scene.scene import Scene
 from warpshadow.stages.geometry.poses import Poses
-from warpshadow.stages.shell.beams import exits_on_host
+from warpshadow.stages.shell.shell_rays import exits_on_host
 from warpshadow.viewer.page_camera import PageCamera, page_scale
 from warpshadow.viewer.quality import Quality
 from warpshadow.viewer.state import ERROR, ViewerState

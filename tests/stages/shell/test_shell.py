@@ -10,7 +10,7 @@ from warpshadow.stages.ray_traced.shared_rays import trace_shared
 from warpshadow.stages.ray_traced.traced_transfer import trace_transfer
 from warpshadow.stages.rays.ray_packets import build_face_tree
 from warpshadow.stages.rays.ray_tracing import trace_shading
-from warpshadow.stages.shell.beams import check_within, exits_from_shell, exits_on_host
+from warpshadow.stages.shell.shell_rays import check_within, exits_from_shell, exits_on_host
 from warpshadow.stages.shell.shell_transfer import SHELL_KERNEL_RADIUS, shell_transfer
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")

@@ -177,8 +177,8 @@ class MergedScene:
 
     @functools.cached_property
     def emitter_beams(self) -> np.ndarray:
-        """Beams of the emitters (:mod:`warpshadow.stages.emitters.beams`), shape [emitter, 2]."""
-        from warpshadow.stages.emitters.beams import beam_of
+        """Beams of the emitters (:mod:`warpshadow.stages.emitters.spot_cones`), shape [emitter, 2]."""
+        from warpshadow.stages.emitters.spot_cones import beam_of
 
         return np.array([beam_of(body.beam) for body in self.scene.bodies if body.is_emitter])
 

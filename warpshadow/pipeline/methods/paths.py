@@ -16,7 +16,7 @@ from warpshadow.stages.light.light_samples import sample_map
 from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.ray_traced.path_tracing import PathSurfaces, trace_bounces
 from warpshadow.stages.receivers.find import Receivers
-from warpshadow.stages.shell.beams import FAR
+from warpshadow.stages.shell.shell_rays import FAR
 from warpshadow.stages.textures.pyramid import Textures
 
 if TYPE_CHECKING:  # it is imported where bodies emit

@@ -23,7 +23,6 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Clock, Node
 from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.stages.bounces.albedo import mean_over_texels
-from warpshadow.stages.emitters.beams import find_axis_weights, weigh_by_beam
 from warpshadow.stages.emitters.emitter_self_visibility import EmitterSelfVisibility, find_self_visibility
 from warpshadow.stages.emitters.light import sum_light
 from warpshadow.stages.emitters.samples import (
@@ -37,6 +36,7 @@ from warpshadow.stages.emitters.samples import (
     place_samples,
 )
 from warpshadow.stages.emitters.shown_beams import show_beams
+from warpshadow.stages.emitters.spot_cones import find_axis_weights, weigh_by_beam
 from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.light.sums import add_light

@@ -27,7 +27,7 @@ from warpshadow.pipeline.receivers.shading_context import (
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.transfers import LightArgument, check_light, shade_free
 from warpshadow.stages.receivers.quadtree import Quadtree
-from warpshadow.stages.shell.beams import check_shell, shell_array
+from warpshadow.stages.shell.shell_rays import check_shell, shell_array
 
 if TYPE_CHECKING:  # they are imported where a body emits, or shines
     from warpshadow.pipeline.shading.emitters import SceneEmitters

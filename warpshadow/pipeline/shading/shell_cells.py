@@ -14,7 +14,7 @@ from warpshadow.assets.basis import CellBasis
 from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.constants import constant
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.shell.beams import check_within
+from warpshadow.stages.shell.shell_rays import check_within
 from warpshadow.stages.shell.shell_transfer import shell_transfer
 
 SHELL_BASIS = CellBasis(fibonacci(512))
