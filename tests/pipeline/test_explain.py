@@ -460,7 +460,11 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
     module, key = kernel.func.__module__.removeprefix("warpshadow."), kernel.key
     if module in ("device.batch", "stages.geometry.poses", "stages.self_visibility.probes", "stages.sparse"):
         return None
-    if module in ("stages.self_visibility.trace", "stages.self_visibility.lookup", "stages.self_visibility.lobes"):
+    if module in (
+        "stages.self_visibility.trace",
+        "stages.self_visibility.lookup",
+        "stages.self_visibility.self_transfer",
+    ):
         return "self-shadows"
     of_visibility = "stages.visibility", "stages.self_visibility.gather", "stages.rays.ray_tracing"
     if module.startswith(of_visibility) or key == "_add_cached_rows":
