@@ -20,7 +20,7 @@ from tensors import small_scene
 
 import warpshadow as ws
 from warpshadow.device import tape, threads
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import locked
 from warpshadow.device.warp_internals import current_tape
 from warpshadow.torch import TorchRenderer, apply
 from warpshadow.tuning import tune
@@ -227,7 +227,7 @@ def test_threads_that_share_a_renderer_each_see_what_they_ask_for(method, restle
 def test_one_at_a_time_means_that_no_two_run_at_once():
     running, most = [], []
 
-    @one_at_a_time
+    @locked
     def step():
         running.append(None)
         most.append(len(running))

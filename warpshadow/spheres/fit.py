@@ -21,7 +21,7 @@ from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.topology import welded
 from warpshadow.device.progress import progress_bar
 from warpshadow.device.tape import unrecorded
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import locked
 from warpshadow.maths.adjacency import area_normals
 from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.spheres.cover import greedy_cover
@@ -63,7 +63,7 @@ class SphereFit(NamedTuple):
 
 
 @check.keywords(refine="steps=1, for spheres that cover the mesh and hardly more")
-@one_at_a_time
+@locked
 def fit_spheres(
     mesh: Mesh,
     count: int | str = AUTO,

@@ -13,11 +13,11 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.basis import Basis, describe_coefficients
 from warpshadow.assets.camera import Camera
-from warpshadow.device.threads import announced, one_at_a_time
+from warpshadow.device.threads import locked, with_lock_and_progress
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.bodies.geometry import GEOMETRY_DTYPES, Geometry, Pivot
 from warpshadow.pipeline.explain import Explanation
-from warpshadow.pipeline.image_inputs import ImageArrays, ImageInputs, takes
+from warpshadow.pipeline.image_inputs import ImageArrays, ImageInputs, accepts_fields_of
 from warpshadow.rendering.renderer import Renderer
 from warpshadow.scene.material import INPUTS_OF_BODIES
 from warpshadow.scene.scene import BodyLike, PerBody, Scene
@@ -25,7 +25,7 @@ from warpshadow.stages.geometry.deform import DeformationGraph
 from warpshadow.stages.geometry.poses import Poses
 from warpshadow.stages.raster.project import compose_clip_matrices
 from warpshadow.torch.arguments import Arguments, Slot
-from warpshadow.torch.autograd import uncompiled
+from warpshadow.torch.autograd import outside_torch_compile
 from warpshadow.torch.replay import Replays
 
 _ELSEWHERE = {
@@ -95,7 +95,7 @@ class TorchRenderer(torch.nn.Module):
     ``load_state_dict`` raises ValueError where they are others.
     """
 
-    @uncompiled
+    @outside_torch_compile
     def __init__(
         self,
         scene: Scene,
@@ -168,9 +168,9 @@ class TorchRenderer(torch.nn.Module):
         if stored_meaning != expected:
             raise ValueError(f"state_dict: got that of a TorchRenderer with {stored_meaning}, expected {expected}")
 
-    @uncompiled
-    @takes(ImageTensors, **_ELSEWHERE)
-    @announced
+    @outside_torch_compile
+    @accepts_fields_of(ImageTensors, **_ELSEWHERE)
+    @with_lock_and_progress
     def forward(self, inputs: ImageTensors) -> torch.Tensor:
         """Render images.
 
@@ -194,8 +194,8 @@ class TorchRenderer(torch.nn.Module):
         affine = [name for name in arguments.names if is_affine.get(name.partition("[")[0])]
         return arguments.apply(self.warp.draw_inputs, slots, affine=affine, replays=self.replays)
 
-    @uncompiled
-    @one_at_a_time
+    @outside_torch_compile
+    @locked
     def layers(
         self, *, geometry: Geometry[torch.Tensor] | None = None, clip_matrices: torch.Tensor | None = None
     ) -> LayerTensors:
@@ -217,9 +217,9 @@ class TorchRenderer(torch.nn.Module):
         masks = torch.cat(quartets, dim=-1)[..., : len(self.scene.bodies)]
         return LayerTensors(depth, normals, bodies, masks.movedim(-1, -3))
 
-    @uncompiled
-    @takes(ImageTensors, **_ELSEWHERE)
-    @announced
+    @outside_torch_compile
+    @accepts_fields_of(ImageTensors, **_ELSEWHERE)
+    @with_lock_and_progress
     def insert(self, photograph: torch.Tensor, inputs: ImageTensors) -> torch.Tensor:
         """Render the bodies in a photograph whose surfaces the scene's shadow catchers model.
 
@@ -238,9 +238,9 @@ class TorchRenderer(torch.nn.Module):
         photograph_slot = arguments.add("photograph", photograph, wp.vec3, size, "linear RGB")
         return arguments.apply(self.warp.insert_inputs, photograph_slot, slots)
 
-    @uncompiled
-    @takes(ImageTensors, **_ELSEWHERE)
-    @one_at_a_time
+    @outside_torch_compile
+    @accepts_fields_of(ImageTensors, **_ELSEWHERE)
+    @locked
     def explain(self, inputs: ImageTensors) -> Explanation:
         """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does.
 
@@ -304,8 +304,8 @@ class TorchRenderer(torch.nn.Module):
         keys = values if isinstance(values, Mapping) else ()
         return f"{argument}[{next((repr(key) for key in keys if self.scene.body_number(key) == number), number)}]"
 
-    @uncompiled
-    @one_at_a_time
+    @outside_torch_compile
+    @locked
     def placed(
         self,
         rotations: torch.Tensor,
@@ -360,7 +360,7 @@ class TorchRenderer(torch.nn.Module):
         placed: Geometry[torch.Tensor] = arguments.apply(place, pose_slots, rest_slots, pivot_slot)
         return placed
 
-    @uncompiled
+    @outside_torch_compile
     def scene_poses(
         self, *, pivot: str | torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -378,7 +378,7 @@ class TorchRenderer(torch.nn.Module):
         )
         return rotations, translations, scales
 
-    @uncompiled
+    @outside_torch_compile
     def scene_cameras(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """The cameras as :meth:`clip_matrices` takes them, as copies; one camera has no batch.
 
@@ -392,8 +392,8 @@ class TorchRenderer(torch.nn.Module):
         R, t, K = camera_tensors if self.warp.has_camera_batch else (item[0] for item in camera_tensors)
         return R, t, K
 
-    @uncompiled
-    @one_at_a_time
+    @outside_torch_compile
+    @locked
     def deformed(
         self,
         body: BodyLike,
@@ -424,7 +424,7 @@ class TorchRenderer(torch.nn.Module):
         )
         return deformed
 
-    @uncompiled
+    @outside_torch_compile
     def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
         """Bind the vertices of a body to its spheres, which are the nodes, as :meth:`Renderer.deformation_graph` does.
 
@@ -432,7 +432,7 @@ class TorchRenderer(torch.nn.Module):
         """
         return self.warp.deformation_graph(body, count=count)
 
-    @uncompiled
+    @outside_torch_compile
     def clip_matrices(
         self, rotations: torch.Tensor, translations: torch.Tensor, intrinsics: torch.Tensor
     ) -> torch.Tensor:

@@ -13,7 +13,7 @@ from warpshadow import check
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant, immutable
 from warpshadow.device.memory import empty
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import locked
 from warpshadow.maths.spatial_sort import z_order
 from warpshadow.pipeline.bodies.geometry import CENTER, Geometry, Pivot, as_geometry, splice
 from warpshadow.scene.blockers import scene_blockers
@@ -219,7 +219,7 @@ class MergedScene:
         return self._array(np.flatnonzero(self.is_two_sided[self.body_of_face]), wp.int32)
 
     @functools.cached_property
-    @one_at_a_time
+    @locked
     def body_spheres(self) -> list:
         """Spheres of each body in its own space; none where the method asks for none."""
         if self._take_spheres is not None:
