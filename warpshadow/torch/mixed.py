@@ -355,7 +355,7 @@ def _as_batch(renderers: Iterable[TorchRenderer]) -> list[TorchRenderer]:
     for number, renderer in enumerate(checked_renderers):
         name = f"renderers[{number}]"
         check.instance(name, renderer, TorchRenderer, "a TorchRenderer")
-        if renderer.warp.has_camera_batch:
+        if renderer.array_renderer.has_camera_batch:
             raise ValueError(f"{name}: got one with cameras of its own, expected one that has its scene's camera")
         got, expected = _batch_description(renderer), _batch_description(checked_renderers[0])
         if got != expected or not _is_same_basis(renderer.basis, checked_renderers[0].basis):
