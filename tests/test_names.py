@@ -66,6 +66,7 @@ BANNED_EVERYWHERE = {
     *("_find_numbers", "_lobe_cells", "_projected_from_scene", "_projected_if_given", "_REUSED", "_Same", "_shining"),
     *("_touching_points", "_towards", "_warn_of_nothing"),
     *("LitPoints", "lit_points"),
+    *("OwnBody", "own_coverage", "own_parts"),
     *("announced", "one_at_a_time", "takes", "uncompiled"),
     *("_CORE", "_EDGE", "_HIDDEN", "_OWN_REACH", "_SUNK", "MANY", "TOUCH"),
     *("light_of_visibility", "shades_transmittance", "widens_edges"),

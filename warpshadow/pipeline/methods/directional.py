@@ -214,13 +214,13 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def _transmittance_self(self, group: Group, projected_light: ProjectedCells) -> wp.array | None:
         """Transmittance past the body of the receivers: by its parts, or looked up, and by rays where asked."""
-        if group.own_parts is not None:
-            coverages = self._coverages(group.own_coverage, projected_light)
+        if group.self_blocking_parts is not None:
+            coverages = self._coverages(group.self_coverage, projected_light)
             return self._past_coverages(None, coverages, None, projected_light)
-        transmittance_self, own = group.looked_up_transmittance(), group.own
-        if transmittance_self is None or own is None:
+        transmittance_self, receiver_body = group.looked_up_transmittance(), group.receiver_body
+        if transmittance_self is None or receiver_body is None:
             return None
-        rays = own.lookup.rays
+        rays = receiver_body.lookup.rays
         if rays is None or projected_light.sun is None:
             return transmittance_self
         if transmittance_self.requires_grad:
@@ -228,7 +228,9 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
                 'self_shadows: got "rays" where a pose or a camera has a gradient, which rays under a sun do not '
                 'have, expected "traced" or "spheres"'
             )
-        of_sun = trace_sun_cells(rays[0], own.probe_weights, rays[1], own.number, projected_light.sun)
+        of_sun = trace_sun_cells(
+            rays[0], receiver_body.probe_weights, rays[1], receiver_body.number, projected_light.sun
+        )
         return blend_sharp_cells(transmittance_self, of_sun, projected_light.sun.slots)
 
     def transfer(self, visibility: CellVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:

@@ -103,10 +103,12 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
             lobes = zeros(visibility.coefficients.shape, dtype=wp.float32, device=visibility.coefficients.device)
             add_rows(group.cached_rows, lobes, channel=1)
             return lobes
-        if group.own is None or group.own.lookup is None or not group.points.size:
+        if group.receiver_body is None or group.receiver_body.lookup is None or not group.points.size:
             return None
         bands = projected_light.bands if visibility.coefficients is None else self._order
-        return group.own.lookup.of_receivers(group.own.probe_weights, order=self._order, bands=bands)
+        return group.receiver_body.lookup.of_receivers(
+            group.receiver_body.probe_weights, order=self._order, bands=bands
+        )
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """The log-visibility of the static spheres, for any light, [row, 1, order²]; and lobes, if one has its own."""

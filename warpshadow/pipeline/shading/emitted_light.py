@@ -112,8 +112,8 @@ def _find_transmittances(
     if not points.size:
         return
     transmittance_of_cells = (
-        transmittance_past(None, group.own_coverage(EMITTER_CELLS))
-        if group.own_parts is not None
+        transmittance_past(None, group.self_coverage(EMITTER_CELLS))
+        if group.self_blocking_parts is not None
         else group.looked_up_transmittance()
     )
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)

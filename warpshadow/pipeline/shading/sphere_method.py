@@ -154,7 +154,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
 
     @abc.abstractmethod
     def self_lookups(self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Projected) -> dict[int, Any]:
-        """Self-visibility of receivers of some bodies, :attr:`.OwnBody.lookup` by body. Differentiable: rotations."""
+        """Self-visibility of receivers of some bodies, :attr:`.ReceiverBody.lookup`. Differentiable: rotations."""
 
     @abc.abstractmethod
     def find_visibility(self, group: Group, projected_light: Projected) -> FoundVisibility:
