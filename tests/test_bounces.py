@@ -536,8 +536,8 @@ def test_what_bounces_between_bodies_that_stand_still_is_kept(method, name, monk
         raise AssertionError("it is computed again")
 
     monkeypatch.setattr(static_form_factors, "trace_form_factors", refuse)
-    monkeypatch.setattr(type(renderer.warp._method), "find_visibility", refuse)
-    monkeypatch.setattr(type(renderer.warp._method), "find_visibility_past_planes", refuse)
+    monkeypatch.setattr(type(renderer.array_renderer._method), "find_visibility", refuse)
+    monkeypatch.setattr(type(renderer.array_renderer._method), "find_visibility_past_planes", refuse)
     with torch.no_grad():
         assert torch.equal(image_of(image_of.start), cached)
         assert not torch.equal(image_of(0.5 * image_of.start), cached)
@@ -565,7 +565,7 @@ def test_a_geometry_given_again_is_not_seen_again_where_light_bounces(method, na
 
     with monkeypatch.context() as patch:
         for function in ("find_visibility", "find_visibility_past_planes", "transfer", "self_lookups"):
-            patch.setattr(type(renderer.warp._method), function, refuse)
+            patch.setattr(type(renderer.array_renderer._method), function, refuse)
         patch.setattr(moving_bounces, "find_cell_transmittance", refuse)
         patch.setattr(patches, "receivers_on_faces", refuse)
         found = image_and_gradient(renderer, name, 2 * start, geometry)

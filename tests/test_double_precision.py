@@ -822,7 +822,7 @@ def test_gradients_of_transfer_from_a_shell_are_exact(is_blocked, double, check)
 
 
 def test_gradients_of_where_rays_leave_a_shell_are_exact(double, check):
-    leave = double("stages.shell.beams").exits_from_shell
+    leave = double("stages.shell.shell_rays").exits_from_shell
     given = (wp.vec3d, 0.3 * random(7, 1, 3, 3)), (wp.vec3d, unit(random(8, 1, 3, 2, 3)))
     check(leave, *given, (wp.vec4d, np.array([[0.1, -0.2, 0.1, 2.2]])))
 
@@ -862,7 +862,7 @@ def test_gradients_of_light_of_emitters_are_exact(double, check, device, is_two_
 
 def beam_of_emitter(double, device):
     """Samples of a tetrahedron that emits within a cone, by its vertices."""
-    emitters, beams = double("stages.emitters.samples"), double("stages.emitters.beams")
+    emitters, beams = double("stages.emitters.samples"), double("stages.emitters.spot_cones")
     sparse = double("stages.sparse").SparseMatrix
     middles = np.random.default_rng(5).dirichlet((1, 1, 1, 1), size=8)
     axis, normals = beams.find_axis_weights(VERTICES, FACES)

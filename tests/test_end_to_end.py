@@ -154,7 +154,7 @@ def error_along_nodes(renderer: TorchRenderer) -> float:
 def test_a_shadow_alone_moves_the_body_that_casts_it(method):
     """The camera sees the ground alone; pose and scale of the blob out of view change what it sees by its shadow."""
     renderer = TorchRenderer(scene_of(method, ON_GROUND))
-    assert set(np.unique(renderer.warp.body_ids())) == {1}
+    assert set(np.unique(renderer.array_renderer.body_ids())) == {1}
     got, expected = gradient_and_differences(Poses(renderer), np.eye(7), 2e-3, slice(3))
     assert np.abs(expected[[0, 3, 4, 5, 6]]).min() > 0
     assert relative_error(got, expected) < SMOOTH
@@ -394,7 +394,7 @@ def test_levels_that_no_sample_takes_have_no_part_in_images_or_gradients(size, c
     for _ in range(2):
         (gradient,) = torch.autograd.grad(renderer(textures=[None, image]).square().sum(), image)
         results.append((renderer(textures=[None, image]).detach(), gradient))
-    assert renderer.warp.view().coarsest_level((None, (size, size))) == coarsest
+    assert renderer.array_renderer.view().coarsest_level((None, (size, size))) == coarsest
     for first, second in zip(*results, strict=True):
         assert torch.equal(first, second)
 
@@ -413,7 +413,7 @@ def test_what_is_not_seen_has_no_part_in_images_or_gradients(method, receivers, 
         if name == "every":
             monkeypatch.setattr(receiver_finder, "seen_vertices", lambda *arguments: np.ones(arguments[-1], bool))
         renderer = TorchRenderer(scene)
-        counts[name] = renderer.warp.view().receivers.points.shape[1]
+        counts[name] = renderer.array_renderer.view().receivers.points.shape[1]
         rotations, translations, scales = renderer.scene_poses()
         shifts = torch.zeros(3, 3, 3)
         shifts[1, :, 0], shifts[2] = 0.1, 50.0  # the last instance sees nothing
@@ -437,7 +437,7 @@ def test_an_image_of_nothing_has_no_gradient(method):
     geometry = renderer.placed(rotations, translations, scales)
     images = [renderer(light), renderer(light, geometry=geometry)]
     assert not images[0].any() and not images[1].any()
-    assert renderer.warp.view().receivers.points.shape == (1, 0)
+    assert renderer.array_renderer.view().receivers.points.shape == (1, 0)
     for image in images:
         image.sum().backward()
     assert not light.grad.any() and not translations.grad.any()

@@ -517,7 +517,7 @@ def test_gloss_that_no_surface_has_is_refused(name, value, message):
     with pytest.raises(ValueError, match=rf"{name}\[.*\]: {message}"):
         renderer(**{name: {"ball": torch.tensor([value])}})
     with pytest.raises(ValueError, match=rf"{name}\[0\]: {message}"):
-        renderer.warp.draw(**{name: {0: wp.array([[value]], dtype=wp.float32)}})
+        renderer.array_renderer.draw(**{name: {0: wp.array([[value]], dtype=wp.float32)}})
 
 
 def test_a_line_search_may_look_beyond_the_gloss_that_there_is():

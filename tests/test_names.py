@@ -65,6 +65,14 @@ BANNED_EVERYWHERE = {
     ),
     *("_find_numbers", "_lobe_cells", "_projected_from_scene", "_projected_if_given", "_REUSED", "_Same", "_shining"),
     *("_touching_points", "_towards", "_warn_of_nothing"),
+    *("LitPoints", "lit_points"),
+    *("OwnBody", "own_coverage", "own_parts"),
+    *("announced", "one_at_a_time", "takes", "uncompiled"),
+    *("_CORE", "_EDGE", "_HIDDEN", "_OWN_REACH", "_SUNK", "MANY", "TOUCH"),
+    *("light_of_visibility", "shades_transmittance", "widens_edges"),
+    *("NodeStage",),
+    *("ShellPatches", "shell_patches"),
+    *("PortionedDirectLight", "PortionedShading", "PortionedTransfer", "PortionedVisibility"),
     *("_ById", "_see_by", "DirectLightOfPortion", "lobe_sum", "projected_patches", "ProjectedPatches"),
     *("shows_gloss", "total_grazing", "VisibilityOfPortion", "where_edges_are"),
 }
@@ -122,6 +130,18 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[str, int]]:
                 yield value.value.strip(), child.lineno
 
 
+def types_in(tree: ast.Module) -> Iterator[str]:
+    """Names of classes, and of a module's type aliases: words that begin with a capital letter, but type variables."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+            maker = getattr(getattr(node.value, "func", None), "id", "")
+            is_type = isinstance(target, ast.Name) and re.match("[A-Z][A-Za-z0-9]*[a-z]|[A-Z]$", target.id)
+            if is_type and maker not in ("TypeVar", "ParamSpec"):
+                yield target.id
+    yield from (node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+
+
 CLASSES = {node.name: node for _, tree in trees() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
 
 
@@ -151,9 +171,14 @@ def documented_arguments(docstring: str) -> Iterator[str]:
             yield from (name.strip(" *") for name in line.partition(":")[0].split(","))
 
 
-def test_no_two_classes_have_one_name():
-    counts = Counter(node.name for _, tree in trees() for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+def test_no_two_classes_or_type_aliases_have_one_name():
+    counts = Counter(name for _, tree in trees() for name in types_in(tree))
     assert len(counts) > 200 and not [name for name, count in counts.items() if count > 1]
+
+
+def test_types_are_classes_and_aliases():
+    tree = ast.parse("A: TypeAlias = int\nB = TypeVar()\nC = Union[int, str]\nd = 1\nclass E: pass\nE_MAX = F[0] = 2")
+    assert list(types_in(tree)) == ["A", "C", "E"]
 
 
 def test_no_two_files_of_stages_have_public_functions_of_one_name():

@@ -49,7 +49,7 @@ def functions_of(name: str, value: object) -> Iterator[tuple[str, object]]:
 ARRAY_LIKE = {numpy.typing.ArrayLike, *typing.get_args(numpy.typing.ArrayLike)}
 """Types of what NumPy makes arrays of, which hold an Any of NumPy's."""
 
-BARE = {dict, list, tuple, set, os.PathLike, *(getattr(abc, name) for name in abc.__all__)}
+BARE_TYPES = {dict, list, tuple, set, os.PathLike, *(getattr(abc, name) for name in abc.__all__)}
 """What has items of any type where it is not said of which."""
 
 
@@ -59,7 +59,7 @@ def is_any(hint: object) -> bool:
         return any(map(is_any, hint))
     if hint in ARRAY_LIKE:
         return False
-    return hint is typing.Any or hint in BARE or any(map(is_any, typing.get_args(hint)))
+    return hint is typing.Any or hint in BARE_TYPES or any(map(is_any, typing.get_args(hint)))
 
 
 def faults(name: str, function) -> list[str]:

@@ -165,7 +165,7 @@ def iterations(scene: ws.Scene, device: str) -> dict[str, Callable[[], object]]:
         renderer(geometry=renderer.placed(rotations, translations, scales)).square().sum().backward()
 
     return {
-        "image of bodies that have moved": whole_image(renderer.warp),
+        "image of bodies that have moved": whole_image(renderer.array_renderer),
         "iteration of a light fit in torch": fit_light,
         "iteration of a texture fit in torch, 256² texels": fit_texture,
         "iteration of a pose fit in torch": fit_pose,

@@ -26,7 +26,7 @@ def fitted(draw, free, target, steps=400):
 
 
 renderer = TorchRenderer(ws.Scene(bodies, skies[0], camera), basis=ws.CellBasis(ws.fibonacci(128)))
-is_seen = renderer.warp.seen_texels("floor") > 0.5
+is_seen = renderer.array_renderer.seen_texels("floor") > 0.5
 texels = fitted(
     lambda x: renderer(textures={"floor": x.sigmoid()}), torch.zeros(64, 64, 3, requires_grad=True), morning
 )

@@ -45,7 +45,7 @@ def test_the_pure_warp_loop_finds_the_way_to_a_pose():
 @pytest.mark.slow
 def test_a_shadow_seen_alone_has_the_derivatives_of_central_differences():
     shadow = shadow_gradient.Shadow(SPHERES, 12)
-    assert set(np.unique(shadow.renderer.warp.body_ids())) == {1}
+    assert set(np.unique(shadow.renderer.array_renderer.body_ids())) == {1}
     got, expected = shadow_gradient.by_adjoint(shadow), shadow_gradient.by_differences(shadow)
     assert (torch.linalg.norm(expected, dim=(0, 1)) > 1).all()
     assert (shadow_gradient.relative_errors(got, expected) < 1e-2).all()

@@ -36,7 +36,7 @@ def calls():
         renderer = TorchRenderer(dataclasses.replace(scene, bounces=bounces), device="cpu")
         rotations, translations, scales = renderer.scene_poses()
         arguments = renderer, rotations, translations.requires_grad_(), scales
-        result[f"image{with_bounces}"] = whole_image(renderer.warp)
+        result[f"image{with_bounces}"] = whole_image(renderer.array_renderer)
         result[f"pose iteration{with_bounces}"] = functools.partial(_fit_pose, *arguments)
     for call in result.values():
         for _ in range(3):

@@ -20,7 +20,7 @@ from tensors import small_scene
 
 import warpshadow as ws
 from warpshadow.device import tape, threads
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import locked
 from warpshadow.device.warp_internals import current_tape
 from warpshadow.torch import TorchRenderer, apply
 from warpshadow.tuning import tune
@@ -227,7 +227,7 @@ def test_threads_that_share_a_renderer_each_see_what_they_ask_for(method, restle
 def test_one_at_a_time_means_that_no_two_run_at_once():
     running, most = [], []
 
-    @one_at_a_time
+    @locked
     def step():
         running.append(None)
         most.append(len(running))
@@ -243,9 +243,9 @@ def test_one_at_a_time_means_that_no_two_run_at_once():
 @pytest.mark.parametrize(
     "call",
     [
-        lambda renderer: renderer.warp.scene_poses(pivot="center"),
-        lambda renderer: renderer.warp.clip_matrices,
-        lambda renderer: renderer.warp.on_faces(np.zeros(1, int), np.full((1, 3), 1 / 3)),
+        lambda renderer: renderer.array_renderer.scene_poses(pivot="center"),
+        lambda renderer: renderer.array_renderer.clip_matrices,
+        lambda renderer: renderer.array_renderer.on_faces(np.zeros(1, int), np.full((1, 3), 1 / 3)),
         lambda renderer: renderer.scene_poses(pivot="center"),
         lambda renderer: renderer(),
     ],
@@ -343,7 +343,7 @@ def test_a_copied_network_has_the_same_images_and_gradients(copied, has_cameras,
     assert torch.equal(image, model(features))
     image.sum().backward()
     assert torch.equal(other.layer.weight.grad, model.layer.weight.grad)
-    assert other.renderer.warp.merged_scene is not model.renderer.warp.merged_scene
+    assert other.renderer.array_renderer.merged_scene is not model.renderer.array_renderer.merged_scene
 
 
 def test_a_copy_does_not_choose_its_method_anew(monkeypatch):

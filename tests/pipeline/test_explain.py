@@ -171,7 +171,7 @@ def test_tensors_that_are_not_written_to_are_known_again_without_a_look_at_them(
         if factor is not None:
             geometry.positions.mul_(factor)
         renderer(geometry=geometry)
-        seen.append(renderer.warp._views.last[1])
+        seen.append(renderer.array_renderer._views.last[1])
     assert seen[0] is seen[1] and seen[1] is not seen[2]
 
 
@@ -192,8 +192,8 @@ def test_textures_that_alone_vary_have_the_images_and_gradients_that_they_have_b
         torch.tensor(random.uniform(size=shape), dtype=torch.float32) for shape in ((8, 8, 3), (162, 3), (24, 24, 4))
     )
     texture.requires_grad_(), colors.requires_grad_()
-    cameras = torch.tensor(renderer.warp.clip_matrices.numpy()[0], requires_grad=True)
-    coefficients = torch.tensor(free_light(renderer.warp).numpy()[0])
+    cameras = torch.tensor(renderer.array_renderer.clip_matrices.numpy()[0], requires_grad=True)
+    coefficients = torch.tensor(free_light(renderer.array_renderer).numpy()[0])
     other = ws.synthetic_sky((0.4, 0.8, 0.1), height=32, sun_radius=8)
     for light in (None, other, None, coefficients, 2 * coefficients, other):
         results = []
@@ -460,7 +460,11 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
     module, key = kernel.func.__module__.removeprefix("warpshadow."), kernel.key
     if module in ("device.batch", "stages.geometry.poses", "stages.self_visibility.probes", "stages.sparse"):
         return None
-    if module in ("stages.self_visibility.trace", "stages.self_visibility.lookup", "stages.self_visibility.lobes"):
+    if module in (
+        "stages.self_visibility.trace",
+        "stages.self_visibility.lookup",
+        "stages.self_visibility.self_transfer",
+    ):
         return "self-shadows"
     of_visibility = "stages.visibility", "stages.self_visibility.gather", "stages.rays.ray_tracing"
     if module.startswith(of_visibility) or key == "_add_cached_rows":

@@ -10,7 +10,7 @@ from warpshadow.assets.harmonic_light import HarmonicLight
 from warpshadow.device.constants import collected
 from warpshadow.device.tape import recorded
 from warpshadow.pipeline.explain import Explanation, decide_which_nodes_run
-from warpshadow.pipeline.node import Call, Clock, Input, Node, NodeStage, detached
+from warpshadow.pipeline.node import Call, Clock, ExplainRow, Input, Node, detached
 
 
 @pytest.fixture
@@ -242,7 +242,7 @@ def test_parts_of_a_stage_and_of_its_adjoint_are_timed_together(clock, monkeypat
     """By a clock that ticks when it is looked at."""
     ticks = itertools.count()
     monkeypatch.setattr(clock, "now", lambda: next(ticks))
-    stage = NodeStage("transfer")
+    stage = ExplainRow("transfer")
     node = Node("", None, Input("vertices", array(requires_grad=True)), stages=(stage,))
     with recorded() as tape:
         call = Call(clock)

@@ -829,7 +829,9 @@ def test_the_cameras_and_poses_of_a_scene_are_what_the_renderer_takes(count):
     expected = np.stack([camera.clip_matrix() for camera in renderer.cameras])
     np.testing.assert_allclose(composed, expected[0] if count is None else expected, rtol=1e-5, atol=1e-5)
     placed = renderer.placed(*renderer.scene_poses())
-    np.testing.assert_allclose(placed.positions.numpy(), renderer.warp.geometry().positions.numpy()[0], atol=1e-6)
+    np.testing.assert_allclose(
+        placed.positions.numpy(), renderer.array_renderer.geometry().positions.numpy()[0], atol=1e-6
+    )
 
 
 def test_rotations_are_scipys_quaternions_with_w_last_and_vectors_in_radians():
@@ -905,7 +907,7 @@ def test_pivots_that_are_none_are_refused():
     with pytest.raises(ValueError, match=r"^pivot: got shape \(3, 3\), expected \[2, 3\]"):
         renderer.placed(*poses, pivot=torch.zeros(3, 3))
     with pytest.raises(ValueError, match="^pivot: got 1 NaN"):
-        renderer.warp.scene_poses(pivot=(0, np.nan, 0))
+        renderer.array_renderer.scene_poses(pivot=(0, np.nan, 0))
 
 
 @pytest.mark.parametrize("backend", ["eager", "aot_eager"])  # the latter is the default, inductor, but for its C++

@@ -84,7 +84,7 @@ def test_gradients_of_depth_and_normals_to_vertices_are_those_of_the_twin(open_s
     face_ids = fragments.face_ids.numpy()[0]
     is_back = np.zeros(face_ids.shape, bool) if fragments.sides is None else fragments.sides.numpy()[0] != face_ids
     assert is_back.any() == open_sheet
-    fixed = renderer.warp.merged_scene.faces.numpy(), face_ids, is_back, camera
+    fixed = renderer.array_renderer.merged_scene.faces.numpy(), face_ids, is_back, camera
     seen = torch.tensor(face_ids >= 0)
     rng = np.random.default_rng(0)
     of_depth, of_normals = rng.normal(size=int(seen.sum())), rng.normal(size=(int(seen.sum()), 3))

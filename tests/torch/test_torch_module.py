@@ -34,10 +34,15 @@ def test_moved_to_a_device_it_draws_there(device):
 
 
 def test_on_the_device_where_it_is_nothing_is_made_anew(renderer):
-    before = renderer.warp
+    before = renderer.array_renderer
     for module in (renderer, network(renderer)):
         module.to("cpu").cpu().float().to(torch.float32)
-    assert renderer.warp is before
+    assert renderer.array_renderer is before
+
+
+def test_the_former_name_of_its_array_renderer_warns(renderer):
+    with pytest.warns(DeprecationWarning, match="array_renderer"):
+        assert renderer.warp is renderer.array_renderer
 
 
 def test_elsewhere_it_is_made_anew(renderer, monkeypatch):

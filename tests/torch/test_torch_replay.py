@@ -133,19 +133,19 @@ def test_geometry_without_a_gradient_that_stays_is_not_computed_again(make_rende
 
 def test_calls_that_cannot_be_captured_stay_plain_and_say_why(make_renderer, monkeypatch):
     renderer, plain = make_renderer(), make_renderer(graphs=False)
-    draw, tries = renderer.warp.draw_inputs, []
+    draw, tries = renderer.array_renderer.draw_inputs, []
 
     def reading(*arguments, **options):
-        tries.append(renderer.warp.device.is_capturing)
+        tries.append(renderer.array_renderer.device.is_capturing)
         if tries[-1]:
             raise RuntimeError("nothing is read while a graph is captured")
         return draw(*arguments, **options)
 
-    monkeypatch.setattr(renderer.warp, "draw_inputs", reading)
+    monkeypatch.setattr(renderer.array_renderer, "draw_inputs", reading)
     for shift in (0.1, 0.2, 0.3, 0.1, 0.2, 0.3, 0.1, 0.2):
         found, expected = image_and_gradients(renderer, shift), image_and_gradients(plain, shift)
         torch.testing.assert_close(found, expected, **SAME)
-    assert not renderer.warp.device.is_capturing
+    assert not renderer.array_renderer.device.is_capturing
     assert sum(tries) == 2
     assert "it cannot be captured: nothing is read" in renderer.replays.reason
 

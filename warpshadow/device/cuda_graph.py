@@ -25,7 +25,7 @@ import warp as wp
 
 from warpshadow.device.constants import collected
 from warpshadow.device.tape import recorded
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import locked
 
 Result = TypeVar("Result")
 
@@ -59,7 +59,7 @@ class Captured(Generic[Result]):
         self._has_run = False
         self._captured: tuple[wp.Graph, Result, list[Any]] | None = None
 
-    @one_at_a_time
+    @locked
     def __call__(self) -> Result:
         """Call or replay it; the captured call's result is written anew by each replay."""
         if not is_captured(self._device) or not self._has_run:

@@ -24,7 +24,7 @@ if hasattr(os, "register_at_fork"):  # a child would wait for ever for a thread 
     os.register_at_fork(before=one_call.acquire, after_in_parent=one_call.release, after_in_child=one_call.release)
 
 
-def one_at_a_time(function: Callable[P, R]) -> Callable[P, R]:
+def locked(function: Callable[P, R]) -> Callable[P, R]:
     """Hold the lock during a function, so that no two threads run such functions at once."""
 
     @functools.wraps(function)
@@ -44,10 +44,10 @@ class _HasProgress(Protocol):
 Shown = TypeVar("Shown", bound=_HasProgress)
 
 
-def announced(function: Callable[Concatenate[Shown, P], R]) -> Callable[Concatenate[Shown, P], R]:
+def with_lock_and_progress(function: Callable[Concatenate[Shown, P], R]) -> Callable[Concatenate[Shown, P], R]:
     """Hold the lock during a method, and print progress lines if it takes long and output goes to a file."""
 
-    @one_at_a_time
+    @locked
     @functools.wraps(function)
     def reporting(self: Shown, *args: P.args, **kwargs: P.kwargs) -> R:
         with waiting("rendering", shows=self.progress):

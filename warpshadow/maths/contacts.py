@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-_CORE = 0.05  # s in units of L: nearer to a contact nothing gets finer
+_CORE_RADIUS = 0.05  # s in units of L: nearer to a contact nothing gets finer
 MAX_GAP = 0.02  # the widest gap of bodies that touch, in units of L …
 _EXTRA_GAP = 0.002  # … and how much wider it is where they touch, too
 _MAX_AREA = 0.03  # share of its area in which a body touches another, at most: more is face on face
@@ -70,5 +70,5 @@ def contact_excess(points: np.ndarray, radii: np.ndarray | float, contacts: Sequ
     result = np.zeros(len(points))
     for contact in contacts:
         distances = np.maximum(cKDTree(contact.points).query(points)[0] - radii, 0)
-        result = np.maximum(result, 1 / ((distances / contact.half_size) ** 2 + _CORE**2))
+        result = np.maximum(result, 1 / ((distances / contact.half_size) ** 2 + _CORE_RADIUS**2))
     return result

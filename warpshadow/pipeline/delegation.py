@@ -4,7 +4,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import locked
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -13,7 +13,7 @@ R = TypeVar("R")
 def delegated(part: str, function: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Any, P], R]:
     """Make a method of a part one of the renderer that has the part; it waits until no other thread is in a call."""
 
-    @one_at_a_time
+    @locked
     @functools.wraps(function)
     def called(self: Any, *args: P.args, **kwargs: P.kwargs) -> R:
         return function(getattr(self, part), *args, **kwargs)

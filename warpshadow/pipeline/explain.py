@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warpshadow.pipeline.node import AnyInput, Call, Input, Node, NodeStage, Timing
+from warpshadow.pipeline.node import AnyInput, Call, ExplainRow, Input, Node, Timing
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def _reason_to_run(inputs: Iterable[AnyInput], reason: Decision, otherwise: str 
     return Decision(True, otherwise) if otherwise else reason
 
 
-def _stage_decision(stage: NodeStage, node: Node, decision: Decision) -> Decision:
+def _stage_decision(stage: ExplainRow, node: Node, decision: Decision) -> Decision:
     """Whether a stage of a node runs, given the decision about the node."""
     if stage is node.stage:
         return decision
@@ -154,7 +154,7 @@ def _stage_decision(stage: NodeStage, node: Node, decision: Decision) -> Decisio
     return _reason_to_run(stage.inputs, decision)
 
 
-def _report(stage: NodeStage, node: Node, forward: Decision) -> StageReport:
+def _report(stage: ExplainRow, node: Node, forward: Decision) -> StageReport:
     """A stage of a node; its adjoint runs if it runs itself and something before it requires a gradient."""
     differentiated = dict.fromkeys(root for item in stage.inputs or (node,) for root in item.differentiated_inputs)
     if not forward:

@@ -102,7 +102,7 @@ class _Taking(Protocol[P, Inputs_co]):
     def __call__(self, method: Callable[[Owner, First, Inputs_co], R]) -> Callable[Concatenate[Owner, First, P], R]: ...
 
 
-def takes(record: Callable[P, Inputs_co], **remedies: str) -> _Taking[P, Inputs_co]:
+def accepts_fields_of(record: Callable[P, Inputs_co], **remedies: str) -> _Taking[P, Inputs_co]:
     """Let users give the fields of a record as arguments to a method whose last argument is the record, ``inputs``.
 
     The method's signature, types and documentation then say them one by one.

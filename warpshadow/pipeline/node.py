@@ -106,7 +106,7 @@ def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
     return origin is not None and origin is getattr(before, "origin", None) and marks[0] == marks[1]
 
 
-class NodeStage(NamedTuple):
+class ExplainRow(NamedTuple):
     """A row of ``explain``: a stage as it is timed and explained.
 
     A named node is one row. Further rows are steps that its function times itself, and steps that it makes needless,
@@ -129,7 +129,7 @@ class Node:
         name: Name of its own stage; empty for a node that is neither timed nor explained.
         function: Computes the value from the inputs' values; None where there is nothing to compute: the value is None.
         inputs: Nodes and inputs of the pipeline; anything else is passed on as it is.
-        items, idle, has_adjoint: As for :class:`NodeStage`; a function of an idle node passes something on.
+        items, idle, has_adjoint: As for :class:`ExplainRow`; a function of an idle node passes something on.
         caches: Whether the value may outlive a call.
         extra_inputs: Other nodes that run for this one.
         stages: Further rows, before its own.
@@ -152,10 +152,10 @@ class Node:
         has_adjoint: bool = True,
         caches: bool = True,
         extra_inputs: tuple["Node", ...] = (),
-        stages: tuple[NodeStage, ...] = (),
+        stages: tuple[ExplainRow, ...] = (),
     ):
         self.function, self.inputs = function, inputs
-        self.stage = NodeStage(name, items, idle, has_adjoint) if name else None
+        self.stage = ExplainRow(name, items, idle, has_adjoint) if name else None
         self.stages = stages if self.stage is None else (*stages, self.stage)
         self.before: list[AnyInput] = []
         self.root_inputs: dict[Input, None] = {}  # in order
@@ -195,7 +195,7 @@ class Node:
         with self.timed(call, self.stage):
             return self.function(*values)
 
-    def timed(self, call: "Call", stage: NodeStage) -> AbstractContextManager[None]:
+    def timed(self, call: "Call", stage: ExplainRow) -> AbstractContextManager[None]:
         """Time one of its stages while it computes its value."""
         inputs = stage.inputs or (self,)
         is_marked = stage.has_adjoint and any(item.differentiated_inputs for item in inputs)

@@ -18,20 +18,20 @@ from warpshadow.assets.light import KnownLightArgument
 from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
-from warpshadow.device.threads import announced, one_at_a_time
+from warpshadow.device.threads import locked, with_lock_and_progress
 from warpshadow.pipeline.bodies.free_shapes import FreeShapes
 from warpshadow.pipeline.bodies.geometry import Geometry, as_geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.delegation import delegated
 from warpshadow.pipeline.explain import Explanation, decide_which_nodes_run, shell_notes
-from warpshadow.pipeline.image_inputs import ImageArrays, takes
+from warpshadow.pipeline.image_inputs import ImageArrays, accepts_fields_of
 from warpshadow.pipeline.methods.by_name import make_method
 from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.receivers.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
-from warpshadow.pipeline.receivers.lit_points import LitPoints
+from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.receivers.unevenness import NearLight
-from warpshadow.pipeline.shading.transfers import Light, join_rows
+from warpshadow.pipeline.shading.transfers import LightArgument, join_rows
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.catchers import CatchersAlone
 from warpshadow.pipeline.views.layers import LayerArrays, Layers, find_layer_arrays, find_layers
@@ -128,7 +128,7 @@ class SceneRenderer:
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.scene!r}, {self.device.alias})"
 
-    @one_at_a_time
+    @locked
     def with_cameras(self: RendererType, cameras: Sequence[Camera]) -> RendererType:
         """Make a renderer of the same scene for other cameras, which may be of another size; it computes little anew.
 
@@ -161,12 +161,12 @@ class SceneRenderer:
 
     # ------------------------------------------------------------------------------------------ geometry and cameras
 
-    @one_at_a_time
+    @locked
     def geometry(self) -> Geometry[wp.array]:
         """Where the scene has its bodies and their spheres; the batch is 1. Not to be written to."""
         return self.merged_scene.scene_geometry
 
-    @one_at_a_time
+    @locked
     def rest(self) -> Geometry[wp.array]:
         """The bodies and their spheres at rest, each body in its own space; the batch is 1. Not to be written to."""
         return self.merged_scene.rest
@@ -177,12 +177,12 @@ class SceneRenderer:
     deformation_graph = delegated("_free_shapes", FreeShapes.deformation_graph)
 
     @property
-    @one_at_a_time
+    @locked
     def clip_matrices(self) -> wp.array:
         """The cameras, mat44 of shape [camera]."""
         return self._views.clip_matrices.value()
 
-    @announced
+    @with_lock_and_progress
     def view(self, geometry: Geometry[wp.array] | None = None, clip_matrices: wp.array | None = None) -> View:
         """See a geometry through cameras; the last view again if nothing that it depends on changed.
 
@@ -210,7 +210,7 @@ class SceneRenderer:
             warn_of_vertex_receivers(view, self._given_scene.bodies, self.cameras[0])
         return view
 
-    @one_at_a_time
+    @locked
     def body_ids(self, view: View | None = None) -> np.ndarray:
         """Body that each sample sees, -1 for none, shape [batch, height, width]."""
         view = self._checked(view)
@@ -227,7 +227,7 @@ class SceneRenderer:
 
     # ------------------------------------------------------------------------------------------ light and reflectance
 
-    @announced
+    @with_lock_and_progress
     def transfer(self) -> wp.array:
         """Transfer vectors of the visible receivers to :attr:`basis`, float32 of shape [view, receiver, coefficient].
 
@@ -244,8 +244,8 @@ class SceneRenderer:
         view = self._scene_view
         return join_rows(view.transfers.value(self._views.call(view)))
 
-    @announced
-    def shade(self, light: Light | None = None, view: LitPoints | None = None) -> wp.array:
+    @with_lock_and_progress
+    def shade(self, light: LightArgument | None = None, view: ShadingContext | None = None) -> wp.array:
         """Light the receivers of a view.
 
         Args:
@@ -265,7 +265,7 @@ class SceneRenderer:
         light_input = self._method.light_input(view, light)
         return self._transport.shading(view, light_input).value(self._views.call(view))
 
-    @announced
+    @with_lock_and_progress
     def reflect(
         self,
         albedo: PerBody[wp.array] | None = None,
@@ -285,7 +285,7 @@ class SceneRenderer:
         materials = self.materials({"albedo": albedo, "textures": textures})
         return view.reflectance(materials).samples.value(self._views.call(view))
 
-    @one_at_a_time
+    @locked
     def seen_texels(self, body: BodyLike) -> np.ndarray:
         """Weight of each texel of a body's texture in the samples of the scene's cameras.
 
@@ -305,8 +305,8 @@ class SceneRenderer:
 
     # ------------------------------------------------------------------------------------------ image
 
-    @takes(ViewArrays)
-    @announced
+    @accepts_fields_of(ViewArrays)
+    @with_lock_and_progress
     def draw(self, inputs: ViewArrays) -> wp.array:
         """Draw images.
 
@@ -347,8 +347,8 @@ class SceneRenderer:
             images = (self.insert(None, light) if self.scene.catchers else self.draw(light)).numpy().copy()
         return images if self.has_camera_batch else images[0]
 
-    @takes(ImageArrays)
-    @announced
+    @accepts_fields_of(ImageArrays)
+    @with_lock_and_progress
     def insert(self, photograph: wp.array | None, inputs: ImageArrays) -> wp.array:
         """Draw images of the bodies in a photograph whose surfaces the shadow catchers model.
 
@@ -407,7 +407,7 @@ class SceneRenderer:
         alone._views.has_warned = True
         return alone
 
-    @one_at_a_time
+    @locked
     def layers(self, view: View | None = None) -> Layers:
         """Find depth, normals, numbers of bodies and masks: the layers beside color.
 
@@ -423,7 +423,7 @@ class SceneRenderer:
             layers = find_layers(self._checked(view), (width, height), supersampling=self.scene.supersampling)
         return layers if has_batch else Layers(*(item[0] for item in layers))
 
-    @one_at_a_time
+    @locked
     def layer_arrays(self, view: View | None = None) -> LayerArrays:
         """Find the same as :meth:`layers` in arrays on the device.
 
@@ -432,7 +432,7 @@ class SceneRenderer:
         height, width = self._size
         return find_layer_arrays(self._checked(view), (width, height), supersampling=self.scene.supersampling)
 
-    @one_at_a_time
+    @locked
     def shadow(self) -> np.ndarray:
         """Compute the direct light on the bodies, divided by the same light without blockers.
 
@@ -452,8 +452,8 @@ class SceneRenderer:
 
     # ------------------------------------------------------------------------------------------ explanation
 
-    @takes(ViewArrays)
-    @one_at_a_time
+    @accepts_fields_of(ViewArrays)
+    @locked
     def explain(self, inputs: ViewArrays) -> Explanation:
         """List the stages that the next call computes and skips, and why.
 

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node
-from warpshadow.pipeline.receivers.lit_points import LitPoints
+from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.light.sums import add_light
@@ -73,7 +73,7 @@ class LightTransport:
     def __init__(self, method: Method):
         self.method = method
 
-    def shading(self, points: LitPoints, light: LightInput, materials: Materials | None = None) -> Node:
+    def shading(self, points: ShadingContext, light: LightInput, materials: Materials | None = None) -> Node:
         """Light reflected by points as white surfaces, vec3 of shape [batch, receiver].
 
         Results for the scene's light and the last other known light are cached.
@@ -87,7 +87,7 @@ class LightTransport:
         return self._with_emitters(without_emitters, points, materials or points.materials)
 
     def shading_without_emitters(
-        self, points: LitPoints, light: LightInput, materials: Materials | None = None
+        self, points: ShadingContext, light: LightInput, materials: Materials | None = None
     ) -> Node:
         """Light that white points reflect, without direct light of emitters, but with their bounced light."""
         if not self.method.merged_scene.scene.bounces:
@@ -98,7 +98,7 @@ class LightTransport:
             return bounce()
         return self.method.cached_for_light("shading", points, light, bounce)
 
-    def bouncing(self, points: LitPoints, light: LightInput, materials: Materials) -> Bouncing:
+    def bouncing(self, points: ShadingContext, light: LightInput, materials: Materials) -> Bouncing:
         """How light bounces onto points."""
         shell_moves = light.shell is not None and light.shell.requires_grad
         return choose_bouncing(
@@ -109,7 +109,7 @@ class LightTransport:
             shares_directions=self.method.shares_directions,
         )
 
-    def notes(self, points: LitPoints, light: LightInput, materials: Materials) -> list[str]:
+    def notes(self, points: ShadingContext, light: LightInput, materials: Materials) -> list[str]:
         """Say how often light bounces, and how, where it does."""
         count = self.method.merged_scene.scene.bounces
         if not count:
@@ -117,7 +117,7 @@ class LightTransport:
         times = "until none is left" if count == "all" else f"{count} time{'s' * (count != 1)}"
         return [f"Light bounces {times}, {self.bouncing(points, light, materials).value}."]
 
-    def _bounced(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
+    def _bounced(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Shading of points, direct and bounced."""
         bouncing = self.bouncing(points, light, materials)
         if bouncing is Bouncing.MOVING:
@@ -136,7 +136,7 @@ class LightTransport:
             direct, self.method.cached_transfers(samples, light.shell), light, points, materials
         )
 
-    def _lit_patch_samples(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
+    def _lit_patch_samples(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Direct shading of the samples of static patches in known light, vec3 of shape [batch, patch sample]."""
         samples = self._static_bounces.patch_samples(points, materials)
         return self._with_emitters(self.method.direct_shading(samples, light), samples, materials)
@@ -150,7 +150,7 @@ class LightTransport:
         own_openness = None if openness is None else lobes.points.select(openness)
         return self.method.lobes.blocked_radiance(lobes, lobes.points.select(bounced), own_openness)
 
-    def _openness(self, points: LitPoints, light: LightInput, materials: Materials) -> Node | None:
+    def _openness(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node | None:
         """Part of the hemispheres of points that no blocker takes, vec3 of shape [view, receiver].
 
         It is found by the rays along which light bounces between static patches; None where light bounces in another
@@ -161,7 +161,7 @@ class LightTransport:
         lit = None if light.is_free else self._lit_patch_samples(points, light, materials)
         return self._static_bounces.openness(points, materials, lit)
 
-    def _with_emitters(self, light: Node, points: LitPoints, materials: Materials) -> Node:
+    def _with_emitters(self, light: Node, points: ShadingContext, materials: Materials) -> Node:
         """Add direct light of emitters to other light on points; nothing where no body emits."""
         if not materials.emission:
             return light

@@ -30,7 +30,7 @@ from warpshadow.scene.visibility import (
     NARROW_ROUGHNESS,
     Visibility,
 )
-from warpshadow.stages.shell.beams import exits_on_host
+from warpshadow.stages.shell.shell_rays import exits_on_host
 
 MAX_BOUNCES = 16
 

@@ -12,14 +12,14 @@ from both sides. Stage 2 uses the cones of warpshadow.stages.visibility.cones an
 so the fit matches the renderer at receivers on and inside spheres.
 """
 
-from warpshadow.spheres.fit import MANY, SphereFit, fit_spheres, is_fitted
+from warpshadow.spheres.fit import SHADOW_SPHERES, SphereFit, fit_spheres, is_fitted
 from warpshadow.spheres.measure import FitReport
 from warpshadow.spheres.occlusion import exact_occlusion
 from warpshadow.spheres.plot import check_matplotlib, plot_spheres
 from warpshadow.spheres.sphere_set import Spheres
 
 __all__ = [
-    "MANY",
+    "SHADOW_SPHERES",
     "FitReport",
     "SphereFit",
     "Spheres",

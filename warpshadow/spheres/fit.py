@@ -21,7 +21,7 @@ from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.topology import welded
 from warpshadow.device.progress import progress_bar
 from warpshadow.device.tape import unrecorded
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import locked
 from warpshadow.maths.adjacency import area_normals
 from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.spheres.cover import greedy_cover
@@ -37,7 +37,9 @@ ALGORITHM_VERSION = 11  # part of the key of cached fits: raise it whenever a fi
 STEPS = 320  # of stage 2: 2000 are no better on a bunny
 
 RECEIVERS = 8192  # receivers that stage 2 draws from
-MANY = 64  # spheres from which on one expects the shadow of the mesh. A flat body, which rarely needs any, has so many
+SHADOW_SPHERES = (
+    64  # spheres from which on one expects the shadow of the mesh. A flat body, which rarely needs any, has so many
+)
 
 BAD_SHADOW = 0.18  # error of a shadow above which it is ragged: a fence has 0.21, rocks, whose shadow is whole, 0.16
 MIN_GROUND_ERROR = 0.01  # of a ground, below which ragged shadows are not visible: of a slab that lies on it, 0.004
@@ -61,7 +63,7 @@ class SphereFit(NamedTuple):
 
 
 @check.keywords(refine="steps=1, for spheres that cover the mesh and hardly more")
-@one_at_a_time
+@locked
 def fit_spheres(
     mesh: Mesh,
     count: int | str = AUTO,
@@ -108,7 +110,7 @@ def fit_spheres(
     for name, value, minimum in (("seed", seed, 0), ("steps", steps, 1)):
         check.integer(name, value, minimum=minimum)
     if count == AUTO and mesh.is_flat:
-        count = MANY
+        count = SHADOW_SPHERES
     if error is not None:
         check.positive("error", error)
     fit_device = check.device("device", device)
@@ -143,7 +145,7 @@ def _warn_of_holes(mesh: Mesh, count: int | str, report: FitReport, seen_from: t
     }
     fault = next((words for words, is_wrong in wrongs.items() if is_wrong), None)
     number = report.sphere_count if isinstance(count, str) else count
-    if fault is None or number < MANY or mesh in _warned or mesh.is_flat:
+    if fault is None or number < SHADOW_SPHERES or mesh in _warned or mesh.is_flat:
         return
     _warned.add(mesh)
     auto_advice = "" if count == AUTO else 'blockers = "auto" takes as many as it needs, and '

@@ -32,7 +32,7 @@ from warpshadow.stages.visibility.cones import make_cone
 from warpshadow.stages.visibility.falloff import make_falloff, make_sphere_adjoint
 from warpshadow.stages.visibility.traversal import sphere_view_type
 
-TOUCH = 0.8
+TOUCHING_RADII = 0.8
 """Largest distance of a sphere's center from the body, outside of it [radii]; one in the open stands for nothing."""
 
 RADIUS_RATE = 10.0  # step of the logarithm of a radius for a step of 1 of a center [1 / diagonals of the bounding box]
@@ -418,7 +418,7 @@ class Refinement:
     def _return_to_body(self, spheres: np.ndarray) -> None:
         """Move spheres that left the body to where they touch it, in place."""
         distances, slopes = self.mesh.signed_distances(spheres[:, :3])
-        excess = np.maximum(distances - TOUCH * spheres[:, 3], 0.0)
+        excess = np.maximum(distances - TOUCHING_RADII * spheres[:, 3], 0.0)
         spheres[:, :3] -= excess[:, None] * slopes
 
     def run(self, start: np.ndarray | DescentState, steps: int) -> Iterator[DescentState]:

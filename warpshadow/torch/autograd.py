@@ -49,7 +49,7 @@ class TensorCall(NamedTuple):
 FindCapture: TypeAlias = Callable[[TensorCall], Replayable | None]
 
 
-def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
+def outside_torch_compile(function: Callable[P, R]) -> Callable[P, R]:
     """Make a function that ``torch.compile`` leaves as it is: it launches Warp's kernels, which cannot be traced.
 
     ``torch.compiler.disable`` would do at once, but imports the compiler, for more than a second.
@@ -90,7 +90,7 @@ def apply(
 ) -> torch.Tensor: ...
 
 
-@uncompiled
+@outside_torch_compile
 def apply(
     function: Callable[..., wp.array | tuple[wp.array, ...]],
     *tensors: torch.Tensor,

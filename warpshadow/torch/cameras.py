@@ -3,12 +3,12 @@
 import torch
 
 from warpshadow import check
-from warpshadow.torch.autograd import check_float32, uncompiled
+from warpshadow.torch.autograd import check_float32, outside_torch_compile
 
 _ROUNDING = 1e-3  # of a matrix's rows, as a part of their length: float32, where the far plane is far away
 
 
-@uncompiled
+@outside_torch_compile
 def clip_matrices_from_opengl(matrices: torch.Tensor) -> torch.Tensor:
     """Convert maps from world to clip space of OpenGL and nvdiffrast: y up, z/w from −1 at the near plane to 1.
 

@@ -15,10 +15,10 @@ import torch
 from warpshadow import check
 from warpshadow.assets.basis import Basis, CellBasis
 from warpshadow.pipeline.bodies.geometry import Geometry, as_geometry
-from warpshadow.pipeline.image_inputs import ImageInputs, takes
+from warpshadow.pipeline.image_inputs import ImageInputs, accepts_fields_of
 from warpshadow.scene.material import INPUTS_OF_BODIES
 from warpshadow.scene.scene import BodyLike, PerBody
-from warpshadow.torch.autograd import check_float32, uncompiled
+from warpshadow.torch.autograd import check_float32, outside_torch_compile
 from warpshadow.torch.renderer import TorchRenderer
 
 _CAMERAS = "clip_matrices=renderer.clip_matrices(R, t, K), R, t and K of renderer.scene_cameras(), one for each image"
@@ -79,8 +79,8 @@ class MixedRenderer(torch.nn.Module):
         """Device of its tensors."""
         return self._renderer(0).device
 
-    @uncompiled
-    @takes(MixedTensors, **_ELSEWHERE)
+    @outside_torch_compile
+    @accepts_fields_of(MixedTensors, **_ELSEWHERE)
     def forward(self, which: torch.Tensor | Sequence[int], inputs: MixedTensors) -> torch.Tensor:
         """Render a batch of images.
 
@@ -121,7 +121,7 @@ class MixedRenderer(torch.nn.Module):
             )
         return batch.join(images_of_scenes)
 
-    @uncompiled
+    @outside_torch_compile
     def placed(
         self,
         which: torch.Tensor | Sequence[int],
@@ -165,7 +165,7 @@ class MixedRenderer(torch.nn.Module):
             geometries[scene] = renderer.placed(R, t, s, moving=moved, pivot=pivot)
         return geometries
 
-    @uncompiled
+    @outside_torch_compile
     def scene_poses(self, *, pivot: str | None = None) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """The bodies' poses, as copies; ``poses[which]`` are the poses of images, as :meth:`placed` takes them.
 
@@ -185,7 +185,7 @@ class MixedRenderer(torch.nn.Module):
                 all_poses[scene, : len(poses)] = poses
         return rotations, translations, scales
 
-    @uncompiled
+    @outside_torch_compile
     def scene_cameras(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """The cameras, as copies; ``cameras[which]`` are the cameras of images, as :meth:`clip_matrices` takes them.
 
@@ -197,7 +197,7 @@ class MixedRenderer(torch.nn.Module):
         R, t, K = (torch.stack(item) for item in zip(*cameras, strict=True))
         return R, t, K
 
-    @uncompiled
+    @outside_torch_compile
     def clip_matrices(
         self, rotations: torch.Tensor, translations: torch.Tensor, intrinsics: torch.Tensor
     ) -> torch.Tensor:
@@ -355,7 +355,7 @@ def _as_batch(renderers: Iterable[TorchRenderer]) -> list[TorchRenderer]:
     for number, renderer in enumerate(checked_renderers):
         name = f"renderers[{number}]"
         check.instance(name, renderer, TorchRenderer, "a TorchRenderer")
-        if renderer.warp.has_camera_batch:
+        if renderer.array_renderer.has_camera_batch:
             raise ValueError(f"{name}: got one with cameras of its own, expected one that has its scene's camera")
         got, expected = _batch_description(renderer), _batch_description(checked_renderers[0])
         if got != expected or not _is_same_basis(renderer.basis, checked_renderers[0].basis):

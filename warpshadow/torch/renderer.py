@@ -13,11 +13,11 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.basis import Basis, describe_coefficients
 from warpshadow.assets.camera import Camera
-from warpshadow.device.threads import announced, one_at_a_time
+from warpshadow.device.threads import locked, with_lock_and_progress
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.bodies.geometry import GEOMETRY_DTYPES, Geometry, Pivot
 from warpshadow.pipeline.explain import Explanation
-from warpshadow.pipeline.image_inputs import ImageArrays, ImageInputs, takes
+from warpshadow.pipeline.image_inputs import ImageArrays, ImageInputs, accepts_fields_of
 from warpshadow.rendering.renderer import Renderer
 from warpshadow.scene.material import INPUTS_OF_BODIES
 from warpshadow.scene.scene import BodyLike, PerBody, Scene
@@ -25,7 +25,7 @@ from warpshadow.stages.geometry.deform import DeformationGraph
 from warpshadow.stages.geometry.poses import Poses
 from warpshadow.stages.raster.project import compose_clip_matrices
 from warpshadow.torch.arguments import Arguments, Slot
-from warpshadow.torch.autograd import uncompiled
+from warpshadow.torch.autograd import outside_torch_compile
 from warpshadow.torch.replay import Replays
 
 _ELSEWHERE = {
@@ -84,7 +84,7 @@ class TorchRenderer(torch.nn.Module):
             on a GPU (:mod:`warpshadow.torch.replay`): tested with captures of a CPU alone so far.
     Attributes:
         replays: The captured calls; ``replays.reason`` says why the last call was not replayed.
-        warp: The :class:`warpshadow.Renderer` of Warp's arrays that it calls; most users need it not.
+        array_renderer: The :class:`warpshadow.Renderer` of Warp's arrays that it calls; most users need it not.
 
     Functions under ``torch.compile`` may call it: it and the functions of this package run as they are, between parts
     that are compiled, so ``fullgraph=True`` refuses them.
@@ -95,7 +95,7 @@ class TorchRenderer(torch.nn.Module):
     ``load_state_dict`` raises ValueError where they are others.
     """
 
-    @uncompiled
+    @outside_torch_compile
     def __init__(
         self,
         scene: Scene,
@@ -108,36 +108,42 @@ class TorchRenderer(torch.nn.Module):
     ):
         super().__init__()
         self.replays = Replays(is_on=check.flag("graphs", graphs))
-        self.warp = Renderer(scene, cameras=cameras, device=str(device), basis=basis, progress=progress)
+        self.array_renderer = Renderer(scene, cameras=cameras, device=str(device), basis=basis, progress=progress)
+
+    @property
+    def warp(self) -> Renderer:
+        """The former name of :attr:`array_renderer`."""
+        check.warn("TorchRenderer.warp: it is called array_renderer from now on", DeprecationWarning)
+        return self.array_renderer
 
     @property
     def scene(self) -> Scene:
         """The scene; a method "auto" has been replaced by the chosen one."""
-        return self.warp.scene
+        return self.array_renderer.scene
 
     def extra_repr(self) -> str:
         """Its bodies and images, for its repr."""
-        return repr(self.warp)
+        return repr(self.array_renderer)
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
         """The scene's cameras."""
-        return self.warp.cameras
+        return self.array_renderer.cameras
 
     @property
     def basis(self) -> Basis:
         """Basis of free light."""
-        return self.warp.basis
+        return self.array_renderer.basis
 
     @property
     def device(self) -> torch.device:
         """Device of its tensors."""
-        return torch.device(wp.device_to_torch(self.warp.device))
+        return torch.device(wp.device_to_torch(self.array_renderer.device))
 
     @property
     def progress(self) -> bool:
         """Whether it shows its progress."""
-        return self.warp.progress
+        return self.array_renderer.progress
 
     def _apply(self, fn: Callable[[torch.Tensor], torch.Tensor], recurse: bool = True) -> "TorchRenderer":
         """Go where a tensor would go: torch calls this for ``to``, ``cuda``, ``half`` and the like."""
@@ -153,7 +159,7 @@ class TorchRenderer(torch.nn.Module):
                 "convert the other modules alone"
             )
         if moved.device != self.device:
-            self.warp = self.warp.moved(str(moved.device))
+            self.array_renderer = self.array_renderer.moved(str(moved.device))
         return super()._apply(fn, recurse)
 
     def get_extra_state(self) -> torch.Tensor:
@@ -168,9 +174,9 @@ class TorchRenderer(torch.nn.Module):
         if stored_meaning != expected:
             raise ValueError(f"state_dict: got that of a TorchRenderer with {stored_meaning}, expected {expected}")
 
-    @uncompiled
-    @takes(ImageTensors, **_ELSEWHERE)
-    @announced
+    @outside_torch_compile
+    @accepts_fields_of(ImageTensors, **_ELSEWHERE)
+    @with_lock_and_progress
     def forward(self, inputs: ImageTensors) -> torch.Tensor:
         """Render images.
 
@@ -192,10 +198,10 @@ class TorchRenderer(torch.nn.Module):
             "textures": not self.scene.bounces,
         }
         affine = [name for name in arguments.names if is_affine.get(name.partition("[")[0])]
-        return arguments.apply(self.warp.draw_inputs, slots, affine=affine, replays=self.replays)
+        return arguments.apply(self.array_renderer.draw_inputs, slots, affine=affine, replays=self.replays)
 
-    @uncompiled
-    @one_at_a_time
+    @outside_torch_compile
+    @locked
     def layers(
         self, *, geometry: Geometry[torch.Tensor] | None = None, clip_matrices: torch.Tensor | None = None
     ) -> LayerTensors:
@@ -210,16 +216,16 @@ class TorchRenderer(torch.nn.Module):
         arguments, slots = self._slots_of(ImageInputs(geometry=geometry, clip_matrices=clip_matrices))
 
         def find(inputs: ImageArrays) -> tuple[wp.array, ...]:
-            result = self.warp.layer_arrays(self.warp.view(inputs.geometry, inputs.clip_matrices))
+            result = self.array_renderer.layer_arrays(self.array_renderer.view(inputs.geometry, inputs.clip_matrices))
             return (*result[:3], *result.masks)
 
         depth, normals, bodies, *quartets = arguments.apply(find, slots)
         masks = torch.cat(quartets, dim=-1)[..., : len(self.scene.bodies)]
         return LayerTensors(depth, normals, bodies, masks.movedim(-1, -3))
 
-    @uncompiled
-    @takes(ImageTensors, **_ELSEWHERE)
-    @announced
+    @outside_torch_compile
+    @accepts_fields_of(ImageTensors, **_ELSEWHERE)
+    @with_lock_and_progress
     def insert(self, photograph: torch.Tensor, inputs: ImageTensors) -> torch.Tensor:
         """Render the bodies in a photograph whose surfaces the scene's shadow catchers model.
 
@@ -236,11 +242,11 @@ class TorchRenderer(torch.nn.Module):
         arguments, slots = self._slots_of(inputs)
         size = self.cameras[0].height, self.cameras[0].width
         photograph_slot = arguments.add("photograph", photograph, wp.vec3, size, "linear RGB")
-        return arguments.apply(self.warp.insert_inputs, photograph_slot, slots)
+        return arguments.apply(self.array_renderer.insert_inputs, photograph_slot, slots)
 
-    @uncompiled
-    @takes(ImageTensors, **_ELSEWHERE)
-    @one_at_a_time
+    @outside_torch_compile
+    @accepts_fields_of(ImageTensors, **_ELSEWHERE)
+    @locked
     def explain(self, inputs: ImageTensors) -> Explanation:
         """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does.
 
@@ -248,12 +254,12 @@ class TorchRenderer(torch.nn.Module):
             inputs: All that an image takes.
         """
         arguments, slots = self._slots_of(inputs)
-        return self.warp.explain_inputs(arguments.filled(slots))
+        return self.array_renderer.explain_inputs(arguments.filled(slots))
 
     def _slots_of(self, inputs: ImageTensors) -> tuple[Arguments, ImageSlots]:
         """The tensors of an image, checked, and its inputs with slots in their place."""
         light, geometry, clip_matrices = inputs.light, inputs.geometry, inputs.clip_matrices
-        has_cameras = self.warp.has_camera_batch and clip_matrices is None
+        has_cameras = self.array_renderer.has_camera_batch and clip_matrices is None
         arguments = Arguments(self.device, cameras=self.cameras if has_cameras else None)
         slots: dict[str, Any] = {}
         if isinstance(light, torch.Tensor):
@@ -267,7 +273,7 @@ class TorchRenderer(torch.nn.Module):
         elif isinstance(light, np.ndarray):  # which a renderer takes for known light
             raise ValueError("light: got ndarray, expected a tensor of torch.float32: torch.as_tensor makes one")
         if geometry is not None:
-            slots["geometry"] = arguments.add_geometry("geometry", geometry, self.warp.rest())
+            slots["geometry"] = arguments.add_geometry("geometry", geometry, self.array_renderer.rest())
         if clip_matrices is not None:
             slots["clip_matrices"] = arguments.add("clip_matrices", clip_matrices, wp.mat44, ())
         if inputs.shell is not None:
@@ -304,8 +310,8 @@ class TorchRenderer(torch.nn.Module):
         keys = values if isinstance(values, Mapping) else ()
         return f"{argument}[{next((repr(key) for key in keys if self.scene.body_number(key) == number), number)}]"
 
-    @uncompiled
-    @one_at_a_time
+    @outside_torch_compile
+    @locked
     def placed(
         self,
         rotations: torch.Tensor,
@@ -352,15 +358,15 @@ class TorchRenderer(torch.nn.Module):
         if isinstance(pivot, torch.Tensor):
             pivot_slot = arguments.add("pivot", pivot, wp.vec3, (count,), "a point of each body's own space")
         arguments.expand()
-        rest_slots = None if rest is None else arguments.add_geometry("rest", rest, self.warp.rest())
+        rest_slots = None if rest is None else arguments.add_geometry("rest", rest, self.array_renderer.rest())
 
         def place(poses: list[wp.array], rest: Geometry[wp.array] | None, pivot: Pivot) -> Geometry[wp.array]:
-            return self.warp.placed(Poses(*poses), rest, moving=moving, pivot=pivot)
+            return self.array_renderer.placed(Poses(*poses), rest, moving=moving, pivot=pivot)
 
         placed: Geometry[torch.Tensor] = arguments.apply(place, pose_slots, rest_slots, pivot_slot)
         return placed
 
-    @uncompiled
+    @outside_torch_compile
     def scene_poses(
         self, *, pivot: str | torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -372,13 +378,13 @@ class TorchRenderer(torch.nn.Module):
             Rotations [body, 3, 3], which multiply column vectors, translations [body, 3] and scales [body].
         """
         points = pivot.detach().cpu().numpy() if isinstance(pivot, torch.Tensor) else pivot
-        poses = self.warp.scene_poses(pivot=points)
+        poses = self.array_renderer.scene_poses(pivot=points)
         rotations, translations, scales = (
             wp.to_torch(array)[0].clone() for array in (poses.rotations, poses.translations, poses.scales)
         )
         return rotations, translations, scales
 
-    @uncompiled
+    @outside_torch_compile
     def scene_cameras(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """The cameras as :meth:`clip_matrices` takes them, as copies; one camera has no batch.
 
@@ -389,11 +395,11 @@ class TorchRenderer(torch.nn.Module):
         names = "rotation", "translation", "intrinsics"
         stacked_arrays = (np.stack([getattr(camera, name) for camera in self.cameras]) for name in names)
         camera_tensors = (torch.tensor(item, dtype=torch.float32, device=self.device) for item in stacked_arrays)
-        R, t, K = camera_tensors if self.warp.has_camera_batch else (item[0] for item in camera_tensors)
+        R, t, K = camera_tensors if self.array_renderer.has_camera_batch else (item[0] for item in camera_tensors)
         return R, t, K
 
-    @uncompiled
-    @one_at_a_time
+    @outside_torch_compile
+    @locked
     def deformed(
         self,
         body: BodyLike,
@@ -418,21 +424,21 @@ class TorchRenderer(torch.nn.Module):
             None if tensor is None else arguments.add(name, tensor, GEOMETRY_DTYPES[name], ("item",))
             for name, tensor in parts.items()
         ]
-        rest_slots = None if rest is None else arguments.add_geometry("rest", rest, self.warp.rest())
+        rest_slots = None if rest is None else arguments.add_geometry("rest", rest, self.array_renderer.rest())
         deformed: Geometry[torch.Tensor] = arguments.apply(
-            lambda rest, *arrays: self.warp.deformed(body, *arrays, rest=rest), rest_slots, *slots
+            lambda rest, *arrays: self.array_renderer.deformed(body, *arrays, rest=rest), rest_slots, *slots
         )
         return deformed
 
-    @uncompiled
+    @outside_torch_compile
     def deformation_graph(self, body: BodyLike, *, count: int = 4) -> DeformationGraph:
         """Bind the vertices of a body to its spheres, which are the nodes, as :meth:`Renderer.deformation_graph` does.
 
         Its functions take Warp's arrays: ``apply(graph.points, matrices, shifts, dtypes=(wp.mat33, wp.vec3))``.
         """
-        return self.warp.deformation_graph(body, count=count)
+        return self.array_renderer.deformation_graph(body, count=count)
 
-    @uncompiled
+    @outside_torch_compile
     def clip_matrices(
         self, rotations: torch.Tensor, translations: torch.Tensor, intrinsics: torch.Tensor
     ) -> torch.Tensor:

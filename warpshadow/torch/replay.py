@@ -60,8 +60,8 @@ class Replays:
             self._kinds[kind_key] = kind  # the last that was used
             while len(self._kinds) > _MAX_KINDS:
                 del self._kinds[next(iter(self._kinds))]
-            static = [call.tensors[number] for number in reused if not call.requires_grad[number]]
-            capture, self.reason = kind.find(call, static)
+            unchanged = [call.tensors[number] for number in reused if not call.requires_grad[number]]
+            capture, self.reason = kind.find(call, unchanged)
         return capture
 
     def _why_plain(self, device: torch.device) -> str:
@@ -79,14 +79,14 @@ class _Kind:
         self._plain_calls = self._failures = 0
         self._capture: Capture | None = None
         self._failure = ""
-        self._static: list[torch.Tensor] = []  # of the last call: held, so that no other lies where they did
+        self._unchanged: list[torch.Tensor] = []  # of the last call: held, so that no other lies where they did
         self._versions: list[tuple[int, int]] | None = None  # of these
 
-    def find(self, call: TensorCall, static: Sequence[torch.Tensor]) -> tuple[Capture | None, str]:
+    def find(self, call: TensorCall, unchanged: Sequence[torch.Tensor]) -> tuple[Capture | None, str]:
         """The capture, or why there is none."""
-        before, self._versions = self._versions, [(tensor.data_ptr(), tensor._version) for tensor in static]
-        self._static = [tensor.detach() for tensor in static]
-        if static and self._versions == before:
+        before, self._versions = self._versions, [(tensor.data_ptr(), tensor._version) for tensor in unchanged]
+        self._unchanged = [tensor.detach() for tensor in unchanged]
+        if unchanged and self._versions == before:
             return None, "geometry or cameras are the same as before: results about them are cached"
         if self._failures == _MAX_FAILURES:
             return None, self._failure
@@ -180,8 +180,8 @@ class Capture:
         return results, functools.partial(self._gradients, [tensor.detach() for tensor in tensors], self._state)
 
     def _launch_forward(self, tensors: Sequence[torch.Tensor]) -> None:
-        for static, tensor in zip(self._inputs, tensors, strict=True):
-            static.copy_(tensor.detach())
+        for unchanged, tensor in zip(self._inputs, tensors, strict=True):
+            unchanged.copy_(tensor.detach())
         self._state += 1
         with current_stream(self._device):
             wp.capture_launch(self._forward)
@@ -193,8 +193,8 @@ class Capture:
         if state != self._state:
             self._launch_forward(tensors)
         self._state += 1  # the memory of this state holds its gradients now
-        for static, adjoint in zip(self._adjoints, adjoints, strict=True):
-            static.copy_(adjoint.detach())
+        for unchanged, adjoint in zip(self._adjoints, adjoints, strict=True):
+            unchanged.copy_(adjoint.detach())
         with current_stream(self._device):
             wp.capture_launch(self._backward)
             return tuple(

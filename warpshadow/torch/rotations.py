@@ -7,12 +7,12 @@ from warpshadow import check
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.stages.geometry.rotations import Vec6
 from warpshadow.stages.geometry.rotations import rotation_matrices as matrices_of_arrays
-from warpshadow.torch.autograd import apply, check_float32, uncompiled
+from warpshadow.torch.autograd import apply, check_float32, outside_torch_compile
 
 _ROTATION_PARAMETERS = {3: wp.vec3, 4: wp.vec4, 6: Vec6, 9: wp.mat33}
 
 
-@uncompiled
+@outside_torch_compile
 def rotation_matrices(parameters: torch.Tensor) -> torch.Tensor:
     """Make rotation matrices of free parameters: of axis-angle vectors in radians (``torch.deg2rad``), quaternions, ….
 

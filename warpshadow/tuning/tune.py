@@ -21,7 +21,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.progress import progress_bar
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import locked
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts, fitted_meshes
 from warpshadow.scene.scene import Bounces, Scene, change_bodies, check_bounces, check_scene
@@ -190,7 +190,7 @@ def _join_words(words: Sequence[str]) -> str:
     return words[0] if len(set(words)) == 1 else ", ".join(words)
 
 
-@one_at_a_time
+@locked
 def tune(
     scene: Scene,
     *,
@@ -348,7 +348,7 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 _resolved: weakref.WeakKeyDictionary[Scene, Scene] = weakref.WeakKeyDictionary()
 
 
-@one_at_a_time
+@locked
 def resolved(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> Scene:
     """Put settings in place of "auto": the first that reach the error of the scene's :class:`Visibility`.
 

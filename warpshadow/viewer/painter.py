@@ -16,7 +16,7 @@ from warpshadow.assets.camera import Camera, framed_points
 from warpshadow.assets.color import auto_exposure, linear_to_srgb
 from warpshadow.assets.known_light import as_light
 from warpshadow.assets.light import EnvironmentMap, KnownLightArgument
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import locked
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
@@ -24,7 +24,7 @@ from warpshadow.pipeline.views.view import View
 from warpshadow.rendering.renderer import Renderer
 from warpshadow.scene.scene import Scene
 from warpshadow.stages.geometry.poses import Poses
-from warpshadow.stages.shell.beams import exits_on_host
+from warpshadow.stages.shell.shell_rays import exits_on_host
 from warpshadow.viewer.page_camera import PageCamera, page_scale
 from warpshadow.viewer.quality import Quality
 from warpshadow.viewer.state import ERROR, ViewerState
@@ -104,7 +104,7 @@ class Painter:
         """Linear RGB, premultiplied, and coverage of a page's view, shape [height, width, 4]."""
         return self._drawn(viewer_state, page, quality)[-1]
 
-    @one_at_a_time
+    @locked
     def spheres(self, viewer_state: ViewerState) -> list[tuple[np.ndarray, np.ndarray]]:
         """Centers and radii of each body's spheres, in its own space; fitted where that was not done yet."""
         quality = Quality(1, cells=64, rays=16, supersampling=1, is_moving=True)
@@ -131,7 +131,7 @@ class Painter:
         small_renderer = renderer.with_cameras([resized_camera])
         return round(auto_exposure(small_renderer.draw(view=small_renderer.view(clip_matrices=matrix)).numpy()[0]), 1)
 
-    @one_at_a_time
+    @locked
     def _drawn(
         self, viewer_state: ViewerState, page: PageCamera, quality: Quality
     ) -> tuple[Renderer, View, Camera, np.ndarray]:

@@ -184,7 +184,7 @@ def test_gradients_of_the_ground_are_those_of_differences(mesh, moving, bounces)
     table, ball, floor = (scene := scene_of(mesh, bounces=bounces)).bodies
     bodies = [table, dataclasses.replace(ball, translation=(0.3, 1.9 if bounces else 1.1, 0.1)), floor]
     renderer = TorchRenderer(dataclasses.replace(scene, bodies=bodies, camera=camera))
-    assert (renderer.warp.body_ids() == 2).all()
+    assert (renderer.array_renderer.body_ids() == 2).all()
     rotations, translations, scales = renderer.scene_poses()
     step = torch.from_numpy(MOVES["table" if moving is None else moving[0]])
 
@@ -215,7 +215,7 @@ def test_gradients_of_own_shadows_are_those_of_differences(middle):
     camera = ws.Camera.look_at((-0.9, 2.2, 0.9), (-0.35, 0.5, 0.25), fov_y=16, size=(24, 24))
     light = ws.synthetic_sky((0.6, 0.5, 0.3), sun_radius=8.0)
     renderer = TorchRenderer(ws.Scene([ws.Body(mesh, receivers="pixel")], light, camera))
-    assert (renderer.warp.body_ids() == 0).all()
+    assert (renderer.array_renderer.body_ids() == 0).all()
     rotations, translations, scales = renderer.scene_poses()
     weights = torch.linspace(0, 1, 24)[:, None, None] + torch.linspace(-1, 1, 24)[:, None]
 

@@ -114,7 +114,7 @@ def test_a_ball_that_touches_the_ground_has_the_gradient_of_wide_steps(bounces, 
     renderer = TorchRenderer(dataclasses.replace(touching, bodies=(ball, floor), bounces=bounces))
     rotations, translations, scales = renderer.scene_poses()
     up = torch.from_numpy(np.float32([[0, 1, 0], [0, 0, 0]]))
-    assert (renderer.warp.body_ids()[0, 48:] == 1).all()
+    assert (renderer.array_renderer.body_ids()[0, 48:] == 1).all()
 
     def loss(height):
         image = renderer(geometry=renderer.placed(rotations, translations + height * up, scales))

@@ -96,7 +96,7 @@ def test_free_light_bounces_as_known_light(renderer, direct):
     light = np.array([[3.0, 2.0, 1.0], *np.random.default_rng(SEED).normal(0, 0.3, size=(8, 3))], np.float32)
     given = {"ball": wp.array(renderer.scene.bodies[0].albedo[None], dtype=wp.vec3)}
     free, known, *without = (
-        torch.from_numpy(each.warp.draw(of, albedo=given).numpy())
+        torch.from_numpy(each.array_renderer.draw(of, albedo=given).numpy())
         for each, of in itertools.product((renderer, direct), (wp.array(light[None], dtype=wp.vec3), light))
     )
     assert relative(without[0], free) > 0.05
@@ -281,7 +281,7 @@ def test_colors_of_a_wall_are_seen_in_what_it_lights(renderer):
     """The gradient of pixels of the ground to the color of the wall beside it is that of bounced light alone."""
     wall = torch.full((1, 3), 0.5, requires_grad=True)
     image = renderer(albedo={"wall": wall})
-    on_ground = torch.from_numpy(renderer.warp.body_ids()[0] == 1)
+    on_ground = torch.from_numpy(renderer.array_renderer.body_ids()[0] == 1)
     image[on_ground].sum().backward()
     assert (wall.grad > 0).all()
 

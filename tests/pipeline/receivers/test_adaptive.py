@@ -113,7 +113,7 @@ def test_pose_gradients_are_central_differences_of_images():
     """Of what the ground shows beyond the ball: a soft shadow, where squares change little between the differences."""
     renderer = TorchRenderer(scene_of("adaptive", size=48, sun_radius=8.0))
     rotations, translations, scales = renderer.scene_poses()
-    ids = renderer.warp.body_ids()[0].reshape(48, 2, 48, 2)
+    ids = renderer.array_renderer.body_ids()[0].reshape(48, 2, 48, 2)
     is_ground = (ids == 1).all(axis=(1, 3))
     padded = np.pad(is_ground, 3)
     far = np.all([padded[i : i + 48, j : j + 48] for i in range(7) for j in range(7)], axis=0)

@@ -229,7 +229,7 @@ class Motion:
     def __init__(self, scene: ws.Scene, moving=None):
         self.renderer = TorchRenderer(scene)
         self.moving = moving
-        self.radii = torch.from_numpy(self.renderer.warp.rest().radii.numpy().copy())[:, :3]
+        self.radii = torch.from_numpy(self.renderer.array_renderer.rest().radii.numpy().copy())[:, :3]
         self.poses = self.renderer.scene_poses()
         self.camera = torch.tensor(scene.camera.clip_matrix(), dtype=torch.float32)[None]
         light = torch.rand(self.renderer.basis.size, 3, generator=torch.Generator().manual_seed(4))
@@ -304,7 +304,7 @@ def test_gradients_of_backs_are_central_differences_of_the_image(method, receive
     """
     supersampling = 1 if receivers == "pixel" else 2
     motion = Motion(replace(bowl_scene(method, receivers, camera=INSIDE), supersampling=supersampling))
-    fragments = motion.renderer.warp.view().fragments
+    fragments = motion.renderer.array_renderer.view().fragments
     assert (fragments.sides.numpy() > fragments.face_ids.numpy()).all()
     motion.values["texture"][:] = 0.5
     gradients = motion.gradients()

@@ -10,13 +10,13 @@ from warpshadow.stages.ray_traced.shared_rays import trace_shared
 from warpshadow.stages.ray_traced.traced_transfer import trace_transfer
 from warpshadow.stages.rays.ray_packets import build_face_tree
 from warpshadow.stages.rays.ray_tracing import trace_shading
-from warpshadow.stages.shell.beams import check_within, exits_from_shell, exits_on_host
+from warpshadow.stages.shell.shell_rays import check_within, exits_from_shell, exits_on_host
 from warpshadow.stages.shell.shell_transfer import SHELL_KERNEL_RADIUS, shell_transfer
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
 SHELL = np.array([0.1, -0.2, 0.3, 1.4])
-PATCHES, CELLS = fibonacci(64), fibonacci(32)
+SHELL_DIRECTIONS, CELLS = fibonacci(64), fibonacci(32)
 
 
 def unit(vectors):
@@ -34,12 +34,12 @@ def put(values, dtype, device):
     return wp.array(np.asarray(values)[None], dtype=dtype, device=device)
 
 
-def twin(points, normals, transmittance, patches=PATCHES):
+def twin(points, normals, transmittance, shell_directions=SHELL_DIRECTIONS):
     """Transfer vectors by the formulas of the module."""
-    area = 4 * np.pi * SHELL[3] ** 2 / len(patches)
-    beams = SHELL[:3] + SHELL[3] * patches - points[:, None]
+    area = 4 * np.pi * SHELL[3] ** 2 / len(shell_directions)
+    beams = SHELL[:3] + SHELL[3] * shell_directions - points[:, None]
     lengths = np.linalg.norm(beams, axis=2)
-    above, facing = (beams * normals[:, None]).sum(axis=2), (beams * patches).sum(axis=2)
+    above, facing = (beams * normals[:, None]).sum(axis=2), (beams * shell_directions).sum(axis=2)
     factors = area * np.maximum(above, 0) * np.maximum(facing, 0)
     factors /= lengths**2 * np.sqrt(np.pi**2 * lengths**4 + area**2)
     if transmittance is None:
@@ -60,7 +60,7 @@ def test_transfer_vectors_are_those_of_the_formulas(is_blocked, device):
     past = None if transmittance is None else put(transmittance, wp.float32, device)
     shell = put(SHELL, wp.vec4, device)
     vectors = put(points, wp.vec3, device), put(normals, wp.vec3, device)
-    found = shell_transfer(*vectors, past, CELLS, shell, PATCHES).numpy()[0]
+    found = shell_transfer(*vectors, past, CELLS, shell, SHELL_DIRECTIONS).numpy()[0]
     expected = twin(points, normals, transmittance)
     np.testing.assert_allclose(found, expected, atol=2e-4 * expected.max())  # ε of the kernel
 
@@ -76,9 +76,9 @@ def test_even_light_of_a_shell_is_the_same_everywhere_within_it(device):
 def test_transfer_from_a_large_shell_is_that_from_infinitely_far(device):
     points, normals = receivers(20)
     vectors = put(points, wp.vec3, device), put(normals, wp.vec3, device)
-    found = shell_transfer(*vectors, None, CELLS, put([0, 0, 0, 1e5], wp.vec4, device), PATCHES).numpy()[0]
-    area = 4 / len(PATCHES)
-    expected = area * np.maximum(normals @ PATCHES.T, 0) / np.sqrt(1 + (area * 1.0) ** 2)
+    found = shell_transfer(*vectors, None, CELLS, put([0, 0, 0, 1e5], wp.vec4, device), SHELL_DIRECTIONS).numpy()[0]
+    area = 4 / len(SHELL_DIRECTIONS)
+    expected = area * np.maximum(normals @ SHELL_DIRECTIONS.T, 0) / np.sqrt(1 + (area * 1.0) ** 2)
     np.testing.assert_allclose(found, expected, atol=2e-5)
 
 

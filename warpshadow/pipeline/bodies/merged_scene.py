@@ -13,13 +13,13 @@ from warpshadow import check
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant, immutable
 from warpshadow.device.memory import empty
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import locked
 from warpshadow.maths.spatial_sort import z_order
 from warpshadow.pipeline.bodies.geometry import CENTER, Geometry, Pivot, as_geometry, splice
 from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.scene.visibility import AUTO
-from warpshadow.spheres import MANY, Spheres
+from warpshadow.spheres import SHADOW_SPHERES, Spheres
 from warpshadow.stages.geometry.poses import Poses
 
 if TYPE_CHECKING:  # it is imported where a body emits
@@ -177,8 +177,8 @@ class MergedScene:
 
     @functools.cached_property
     def emitter_beams(self) -> np.ndarray:
-        """Beams of the emitters (:mod:`warpshadow.stages.emitters.beams`), shape [emitter, 2]."""
-        from warpshadow.stages.emitters.beams import beam_of
+        """Beams of the emitters (:mod:`warpshadow.stages.emitters.spot_cones`), shape [emitter, 2]."""
+        from warpshadow.stages.emitters.spot_cones import beam_of
 
         return np.array([beam_of(body.beam) for body in self.scene.bodies if body.is_emitter])
 
@@ -219,7 +219,7 @@ class MergedScene:
         return self._array(np.flatnonzero(self.is_two_sided[self.body_of_face]), wp.int32)
 
     @functools.cached_property
-    @one_at_a_time
+    @locked
     def body_spheres(self) -> list:
         """Spheres of each body in its own space; none where the method asks for none."""
         if self._take_spheres is not None:
@@ -233,7 +233,7 @@ class MergedScene:
             return np.diff(self.first_sphere)
         if not self.scene.visibility.traits.has_spheres:
             return np.zeros(len(self.scene.bodies), int)
-        blockers = (MANY if body.blockers == AUTO else body.blockers for body in self.scene.bodies)
+        blockers = (SHADOW_SPHERES if body.blockers == AUTO else body.blockers for body in self.scene.bodies)
         return np.array([len(spheres) if isinstance(spheres, Spheres) else spheres for spheres in blockers])
 
     @functools.cached_property

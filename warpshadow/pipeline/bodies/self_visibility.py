@@ -32,12 +32,6 @@ from warpshadow.stages.rays.ray_packets import FaceTree, build_face_tree
 from warpshadow.stages.receivers.find import Receivers, Span
 from warpshadow.stages.self_visibility.buried import find_buried, find_dilation
 from warpshadow.stages.self_visibility.gather import gather_self_transmittance
-from warpshadow.stages.self_visibility.lobes import (
-    BodyRotation,
-    find_body_rotation,
-    project_rows,
-    self_visibility_lobes,
-)
 from warpshadow.stages.self_visibility.lookup import (
     ResamplingKernels,
     ResamplingWeights,
@@ -50,6 +44,12 @@ from warpshadow.stages.self_visibility.probes import (
     VisibilityProbes,
     find_probes,
     longest_edge,
+)
+from warpshadow.stages.self_visibility.self_transfer import (
+    BodyRotation,
+    find_body_rotation,
+    project_rows,
+    self_visibility_lobes,
 )
 from warpshadow.stages.self_visibility.sun_cells import RayProbes
 from warpshadow.stages.self_visibility.trace import (

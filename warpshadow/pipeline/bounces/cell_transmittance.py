@@ -53,9 +53,13 @@ def find_cell_transmittance(
     else:
         directions, transmittance_self = HARMONIC_GATHER_CELLS, None
         transmittance_nonplanar = _transmittance(method, group, merged_scene.nonplanar_bodies, spheres, directions)
-    own = group.own
-    if transmittance_self is None and own is not None and not (own.is_solid or merged_scene.is_flat[own.number]):
-        transmittance_self = _transmittance(method, group, [own.number], spheres, directions)
+    receiver_body = group.receiver_body
+    if (
+        transmittance_self is None
+        and receiver_body is not None
+        and not (receiver_body.is_solid or merged_scene.is_flat[receiver_body.number])
+    ):
+        transmittance_self = _transmittance(method, group, [receiver_body.number], spheres, directions)
     if transmittance_nonplanar is None:
         transmittance_nonplanar = wp.full(
             (*group.points.shape, len(directions)), 1.0, wp.float32, device=group.points.device

@@ -16,7 +16,7 @@ from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
 from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.bounces.proxies import PlacedProxies, Proxies
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
-from warpshadow.pipeline.node import Call, Node, NodeStage
+from warpshadow.pipeline.node import Call, ExplainRow, Node
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.scene.visibility import Visibility
 from warpshadow.stages.bounces.overlays import overlaid_radiosity
@@ -126,7 +126,7 @@ class Gathering:
         )
         names = "self light", "plane light", "sphere light"
         stages = tuple(
-            NodeStage(f"{name}{suffix}", item_text, why_not or why) for name, why in zip(names, idle, strict=True)
+            ExplainRow(f"{name}{suffix}", item_text, why_not or why) for name, why in zip(names, idle, strict=True)
         )
         functions = self._from_itself, self._from_planes, self._from_spheres
         first = 1 if only_others else 0
@@ -146,13 +146,17 @@ class Gathering:
         return add_light(*lights)
 
     def _from_itself(self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
-        own = group.own
-        if own is None or own.number not in outgoing.senders.bodies or self._is_flat[own.number]:
+        receiver_body = group.receiver_body
+        if (
+            receiver_body is None
+            or receiver_body.number not in outgoing.senders.bodies
+            or self._is_flat[receiver_body.number]
+        ):
             return None
-        form_factors = self._self_form_factors.of(own.number)
+        form_factors = self._self_form_factors.of(receiver_body.number)
         if form_factors.is_zero:  # a convex body sends itself nothing
             return None
-        return self_light(form_factors, outgoing.of_body(own.number), *own.probe_weights)
+        return self_light(form_factors, outgoing.of_body(receiver_body.number), *receiver_body.probe_weights)
 
     def _from_planes(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance
@@ -182,7 +186,9 @@ class Gathering:
         count = common_batch({"geometry": group.points, "light": proxy_radiance, "proxies": proxies.radii})
         points, normals = expand(group.points, count), expand(group.normals, count)
         spheres = expand(proxies.centers, count), expand(proxies.radii, count)
-        is_same = all(array is own for array, own in zip(spheres, (proxies.centers, proxies.radii), strict=True))
+        is_same = all(
+            array is of_proxies for array, of_proxies in zip(spheres, (proxies.centers, proxies.radii), strict=True)
+        )
         return sphere_light(
             *(points, normals, *spheres, proxy_radiance),
             expand_rows(transmittance.transmittance_nonplanar, count),

@@ -28,15 +28,15 @@ from warpshadow.pipeline.bounces.patches import OF_PATCH_SAMPLES, ScenePatches, 
 from warpshadow.pipeline.bounces.proxies import PlacedProxies, Proxies
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
-from warpshadow.pipeline.node import Call, Node, NodeStage, identity
-from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
+from warpshadow.pipeline.node import Call, ExplainRow, Node, identity
+from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.sphere_method import (
     LitPortion,
-    PortionedShading,
-    PortionedTransfer,
     ProjectedLight,
+    ShadingNode,
     SphereMethod,
+    TransferNode,
 )
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.scene.scene import Bounces
@@ -47,7 +47,7 @@ from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.receivers.find import Receivers
 
 
-class TransferForBounces(PortionedTransfer):
+class TransferForBounces(TransferNode):
     """Receivers in free light, a list of :class:`PortionForBounces`: transfer vectors, and transmittance of cells."""
 
     def result_of(self, portion: LitPortion) -> PortionForBounces:
@@ -55,7 +55,7 @@ class TransferForBounces(PortionedTransfer):
         return _portion_for_bounces(self.method, portion)
 
 
-class ShadingForBounces(PortionedShading):
+class ShadingForBounces(ShadingNode):
     """Receivers in known light, a list of :class:`PortionForBounces`: direct light, and transmittance of cells."""
 
     def compute(self, call: Call) -> Any:
@@ -72,7 +72,7 @@ def _portion_for_bounces(method: SphereMethod, portion: LitPortion) -> PortionFo
     return PortionForBounces(portion.result, portion.group, transmittance)
 
 
-class PortionedDirectLight(Node):
+class DirectLightNode(Node):
     """Direct light, in portions.
 
     Args:
@@ -91,11 +91,11 @@ class PortionedDirectLight(Node):
         item_text: str | Callable[[], str],
         suffix: str = "",
         others: tuple[Node | None, ...] = (),
-        stages: tuple[NodeStage, ...] = (),
+        stages: tuple[ExplainRow, ...] = (),
     ):
         self._visibility = visibility
         if free_light is not None:
-            self._shading = NodeStage(f"shading{suffix}", item_text, inputs=(visibility, free_light))
+            self._shading = ExplainRow(f"shading{suffix}", item_text, inputs=(visibility, free_light))
             stages = self._shading, *stages
         super().__init__("", None, free_light, *others, extra_inputs=(visibility,), stages=stages)
 
@@ -139,7 +139,7 @@ def _add_emitted(lit: list[PortionForBounces], emitted: wp.array) -> list[Portio
 class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
-    points: LitPoints
+    points: ShadingContext
     visibility: TransferForBounces | ShadingForBounces  # of the patch samples
     frames: Node  # of flat bodies
     placed_proxies: Node  # proxies of the patches, in the world
@@ -164,8 +164,8 @@ class Radiosity(Node):
         self._self_form_factors, self._gathering = self_form_factors, gathering
         item_text = f"{len(senders.areas):,} patches"
         idle = ALL_FLAT if all(senders.merged_scene.is_flat[body] for body in senders.bodies) else ""
-        self._reflection = NodeStage("radiosity", item_text)
-        self._self_reflection = NodeStage("self light of patches", item_text, idle)
+        self._reflection = ExplainRow("radiosity", item_text)
+        self._self_reflection = ExplainRow("self light of patches", item_text, idle)
         stages = self._reflection, self._self_reflection, *gathering.stages
         super().__init__("", None, lit, albedo, placed_proxies, frames, weights, stages=stages)
 
@@ -207,7 +207,7 @@ class Radiosity(Node):
         )
 
 
-class BouncedShading(PortionedDirectLight):
+class BouncedShading(DirectLightNode):
     """Shading of receivers, direct and bounced.
 
     Args:
@@ -250,7 +250,7 @@ class MovingBounces:
         )
         self._proxies: dict[Senders, Proxies] = {}
 
-    def shading(self, points: LitPoints, light: LightInput, materials: Materials) -> Node:
+    def shading(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Node of the shading of points, direct and bounced, vec3 of shape [batch, receiver].
 
         Their visibility is cached where it holds for other calls: in free light, and where colors vary.
@@ -263,13 +263,13 @@ class MovingBounces:
         method, senders = self._method, self._patches.senders(materials)
         projected_light = method.projected_light(points, light)
         if not senders.bodies:
-            direct = PortionedShading(method, points, projected_light, light)
+            direct = ShadingNode(method, points, projected_light, light)
             return Node("bounces", identity, direct, idle="every body is black")
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
         make_visibility = functools.partial(
             TransferForBounces if light.is_free else ShadingForBounces,
             method,
-            projected_light=method.light_of_visibility(points, light),
+            projected_light=method.visibility_basis(points, light),
             light=light,
         )
         free_light = projected_light if light.is_free else None
@@ -286,7 +286,7 @@ class MovingBounces:
         self,
         make_visibility: Callable[..., TransferForBounces | ShadingForBounces],
         proxies: Proxies,
-        points: LitPoints,
+        points: ShadingContext,
     ) -> PatchSampleNodes:
         """Nodes of the patch samples of the bodies around points."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
@@ -310,7 +310,7 @@ class MovingBounces:
         arguments = f"{len(senders.sides):,} patch samples", OF_PATCH_SAMPLES
         lit: Node = patch_samples.visibility
         if free_light is not None:
-            lit = PortionedDirectLight(patch_samples.visibility, free_light, *arguments)
+            lit = DirectLightNode(patch_samples.visibility, free_light, *arguments)
         if materials.emission:
             lit = Node("", _add_emitted, lit, self._method.light_of_emitters(patch_samples.points, materials))
         albedo = self._patches.albedo(materials, senders.bodies)

@@ -18,7 +18,7 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.bodies.scene_planes import ScenePlanes
 from warpshadow.pipeline.bounces.contacts import find_contacts
 from warpshadow.pipeline.node import Node
-from warpshadow.pipeline.receivers.lit_points import LitPoints
+from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
 from warpshadow.stages.bounces.radiosity import mean_over_patch_samples
 from warpshadow.stages.patches import MAX_PATCHES, SAMPLES_PER_PATCH, Patches, find_patches, find_plane_patches
@@ -272,11 +272,13 @@ def _joined(parts: list[np.ndarray], dtype: type) -> np.ndarray:
     return np.concatenate(parts).astype(dtype) if parts else np.empty(0, dtype)
 
 
-def lit_patch_samples(senders: Senders, points: LitPoints, nearest_spheres: np.ndarray | None = None) -> LitPoints:
+def lit_patch_samples(
+    senders: Senders, points: ShadingContext, nearest_spheres: np.ndarray | None = None
+) -> ShadingContext:
     """Make lit points of the patch samples of bodies around other points."""
     items, find = f"{len(senders.sides):,} patch samples", senders.patch_samples
     receivers = Node("patch samples", find, points.vertices, points.normals, items=items)
-    return LitPoints(
+    return ShadingContext(
         points.merged_scene,
         points.materials,
         points.vertices,

@@ -13,42 +13,42 @@ SELF_BOUNCES = 8  # bounces of light that stays within one body; in a bowl of al
 
 def after_bounces(
     bounces: Bounces,
-    light: Callable[[wp.array | None], wp.array],
-    reflect: Callable[[wp.array, wp.array | None], wp.array],
+    by_others: Callable[[wp.array | None], wp.array],
+    add_by_self: Callable[[wp.array, wp.array | None], wp.array],
     areas: np.ndarray,
     *,
     self_bounces: int,
 ) -> wp.array:
     """Radiosity of patches after all bounces but the last, which the receivers gather.
 
-        B₀ = reflect(light(None), None),   Bₙ₊₁ = reflect(light(Bₙ), Bₙ)
+        B₀ = add_by_self(by_others(None), None),   Bₙ₊₁ = add_by_self(by_others(Bₙ), Bₙ)
 
-    After the last bounce between bodies, ``reflect`` alone is repeated: light that stays within one body.
+    After the last bounce between bodies, ``add_by_self`` alone is repeated: light that stays within one body.
 
     Args:
         bounces: How often light bounces.
-        light: Function of the radiosity B, None before the first bounce: the light of patches that is not from their
-            own body, so from the sky and from other bodies. Only ``reflect`` reads its result.
-        reflect: Function of that light and of B: adds the light from their own body, none for None, and returns the
+        by_others: Function of the radiosity B, None before the first bounce: the light of patches that is not from
+            their own body, so from the sky and from other bodies. Only ``add_by_self`` reads its result.
+        add_by_self: Function of that light and of B: adds the light from their own body, none for None, and returns the
             next radiosity.
         areas: Of patches, shape [patch].
-        self_bounces: How often ``reflect`` alone is repeated after the last bounce, or after each of "all"; 0 where
+        self_bounces: How often ``add_by_self`` alone is repeated after the last bounce, or after each of "all"; 0 where
             bodies send themselves no light.
     Returns:
         Radiosity, vec3 of shape [batch, patch].
     """
-    bounced_light = light(None)
-    radiosity = reflect(bounced_light, None)
+    radiosity_by_others = by_others(None)
+    radiosity = add_by_self(radiosity_by_others, None)
     if bounces == "all":
         terms: list[wp.array] = []
         for bounce in range(TERM_COUNT):
-            bounced_light = light(radiosity) if bounce else bounced_light
+            radiosity_by_others = by_others(radiosity) if bounce else radiosity_by_others
             for _ in range(max(self_bounces, 1 if bounce else 0)):
-                radiosity = reflect(bounced_light, radiosity)
+                radiosity = add_by_self(radiosity_by_others, radiosity)
             terms.append(radiosity)
         return add_tail(terms, areas)
     for bounce in range(1, bounces + self_bounces):
         if bounce < bounces:
-            bounced_light = light(radiosity)
-        radiosity = reflect(bounced_light, radiosity)
+            radiosity_by_others = by_others(radiosity)
+        radiosity = add_by_self(radiosity_by_others, radiosity)
     return radiosity

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _NEAR = 0.25  # how far behind a flat body covered patches lie, at most, in radii of their proxies
 _FACING = 0.9  # cosine between their normals and its own, at least
 _COVERED = 0.25  # part of its area behind which such patches lie, at least
-_HIDDEN = 0.5  # part of the area of a covered patch that it hides, at least
+_MIN_HIDDEN_SHARE = 0.5  # part of the area of a covered patch that it hides, at least
 _REACH = 0.01  # how far bodies reach out before it that may see it, in units of its size
 
 
@@ -60,7 +60,7 @@ def find_overlays(senders: Senders, depths: np.ndarray) -> Overlays | None:
             if senders.areas[side[is_before]].sum() < _COVERED * senders.areas[side].sum():
                 continue
             rows, columns = chosen[nearest[is_before]], side[is_before]
-            covered = np.bincount(rows, senders.areas[columns], len(radii)) > _HIDDEN * senders.areas
+            covered = np.bincount(rows, senders.areas[columns], len(radii)) > _MIN_HIDDEN_SHARE * senders.areas
             rows, columns = rows[covered[rows]], columns[covered[rows]]
             weights = np.concatenate([weights, np.stack([rows, columns, senders.areas[columns]], axis=1)])
     if not len(weights):

@@ -65,13 +65,20 @@ class SelfFormFactors:
         """Form factors of each patch sample of a group to the patches of its body, among all patches."""
         from scipy.sparse import csr_matrix
 
-        shape, own = (group.points.shape[1], len(senders.areas)), group.own
-        if own is None or own.number not in senders.bodies or senders.merged_scene.is_flat[own.number]:
+        shape, receiver_body = (group.points.shape[1], len(senders.areas)), group.receiver_body
+        if (
+            receiver_body is None
+            or receiver_body.number not in senders.bodies
+            or senders.merged_scene.is_flat[receiver_body.number]
+        ):
             return csr_matrix(shape, dtype=np.float32)
-        factors, (probes, weights) = self.of(own.number).to_scipy(), (item.numpy()[0] for item in own.probe_weights)
+        factors, (probes, weights) = (
+            self.of(receiver_body.number).to_scipy(),
+            (item.numpy()[0] for item in receiver_body.probe_weights),
+        )
         starts = np.arange(0, probes.size + 1, 3)
         of_patches = csr_matrix((weights.ravel(), probes.ravel(), starts), (shape[0], factors.shape[0])) @ factors
-        first = senders.first[senders.bodies.index(own.number)]
+        first = senders.first[senders.bodies.index(receiver_body.number)]
         return csr_matrix((of_patches.data, of_patches.indices + first, of_patches.indptr), shape)
 
 

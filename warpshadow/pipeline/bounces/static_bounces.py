@@ -26,7 +26,7 @@ from warpshadow.pipeline.bounces.patches import ScenePatches, Senders, lit_patch
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
 from warpshadow.pipeline.bounces.static_form_factors import StaticFormFactors, find_form_factors
 from warpshadow.pipeline.node import Input, Node, field_of
-from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
+from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.bounces.colored import ColoredTransfer, colored_light
 from warpshadow.stages.bounces.radiosity import reflect
@@ -46,12 +46,12 @@ class StaticBounces:
         self._bounces = method.merged_scene.scene.bounces  # 1 or more, or "all" until nothing is left
         self._is_still = method.shares_directions
 
-    def patch_samples(self, points: LitPoints, materials: Materials) -> LitPoints:
+    def patch_samples(self, points: ShadingContext, materials: Materials) -> ShadingContext:
         """The points of patches that are lit, of one instance."""
         senders = self._patches.senders(materials)
         return points.cached("patch samples", senders, lambda: lit_patch_samples(senders, points))
 
-    def add_bounces(self, direct: Node, at_patch_samples: Node, points: LitPoints, materials: Materials) -> Node:
+    def add_bounces(self, direct: Node, at_patch_samples: Node, points: ShadingContext, materials: Materials) -> Node:
         """Add bounces to direct shading.
 
         Args:
@@ -69,7 +69,7 @@ class StaticBounces:
         return self._shading(direct, light, factors, points, materials)
 
     def add_free_bounces(
-        self, direct: Node, transfers: Node, light: Input, points: LitPoints, materials: Materials
+        self, direct: Node, transfers: Node, light: Input, points: ShadingContext, materials: Materials
     ) -> Node:
         """Add bounces to the shading of free light; its transfer among the colors of the scene is cached.
 
@@ -109,7 +109,9 @@ class StaticBounces:
         transfer = points.cached("bounces", lit, bounced)
         return Node("bounces", shade, direct, transfer, light, factors, items=self._item_text(points, senders))
 
-    def _shading(self, direct: Node, patch_light: Node, factors: Node, points: LitPoints, materials: Materials) -> Node:
+    def _shading(
+        self, direct: Node, patch_light: Node, factors: Node, points: ShadingContext, materials: Materials
+    ) -> Node:
         """Shading with bounces, given the direct light on patches, vec3 of shape [batch, patch]."""
         senders = self._patches.senders(materials)
 
@@ -136,7 +138,7 @@ class StaticBounces:
         arguments = self._bounces, light_of_others, reflect_all, senders.areas
         return multiply(factors.to_cache_points, after_bounces(*arguments, self_bounces=SELF_BOUNCES))
 
-    def openness(self, points: LitPoints, materials: Materials, at_patch_samples: Node | None) -> Node | None:
+    def openness(self, points: ShadingContext, materials: Materials, at_patch_samples: Node | None) -> Node | None:
         """Part of the hemispheres of points that no blocker takes, by the rays that find the light of blockers.
 
         Both so vary alike, and blockers' mean radiance does not.
@@ -153,12 +155,12 @@ class StaticBounces:
             return None
         return field_of(self._factors(points, materials, senders, at_patch_samples), "openness")
 
-    def _item_text(self, points: LitPoints, senders: Senders) -> Callable[[], str]:
+    def _item_text(self, points: ShadingContext, senders: Senders) -> Callable[[], str]:
         weak_points = points.weak
         return lambda: f"{receiver_text(weak_points)}, {len(senders.areas):,} patches, {self._bounces} bounces"
 
     def _factors(
-        self, points: LitPoints, materials: Materials, senders: Senders, at_patch_samples: Node | None = None
+        self, points: ShadingContext, materials: Materials, senders: Senders, at_patch_samples: Node | None = None
     ) -> Node:
         """Node of the form factors, which are those of any light: that of patch samples tells where rays are sent."""
         if not self._is_still or materials is not points.materials:  # form factors of a fit must not follow its light

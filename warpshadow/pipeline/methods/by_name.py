@@ -6,13 +6,13 @@ A row of ``METHOD_TRAITS`` registers a method. The class is METHOD of the module
 import importlib
 
 from warpshadow.assets.basis import Basis
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import locked
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.scene.visibility import DEFAULT_METHOD
 
 
-@one_at_a_time  # kernels must not be made while another thread loads some
+@locked  # kernels must not be made while another thread loads some
 def make_method(merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False) -> Method:
     """Make the method of a scene.
 

@@ -7,7 +7,7 @@ import warp as wp
 
 from warpshadow.pipeline.methods.glossy_cells import CellMethod, shading_with_cells, transmittance_of_cells
 from warpshadow.pipeline.node import Node, field_of
-from warpshadow.pipeline.receivers.lit_points import receiver_text
+from warpshadow.pipeline.receivers.shading_context import receiver_text
 from warpshadow.pipeline.shading.lobe_light import LitLobes, LobeVisibility
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis
@@ -37,7 +37,7 @@ class CellLobes(LobeVisibility):
         In known light that does not bounce the shading of the view has found it.
         """
         points, light = lobes.points, lobes.light
-        visibility_light = self._method.light_of_visibility(points, light)
+        visibility_light = self._method.visibility_basis(points, light)
         if light.is_free or self._merged_scene.scene.bounces:
             transmittance = transmittance_of_cells(self._method, points, light)
         else:
@@ -71,9 +71,9 @@ class CellLobes(LobeVisibility):
         if not diffuse.size:
             return diffuse
         of_cells = transfer = directional_transfer(transmittance, receivers.normals, projected_light.cosine_directions)
-        if projected_light.patches is not None:
+        if projected_light.shell_cells is not None:
             arguments = receivers.points, receivers.normals, transmittance, projected_light.blocking_directions
-            transfer = projected_light.patches.transfer(*arguments)
+            transfer = projected_light.shell_cells.transfer(*arguments)
         light = projected_light.coefficients if free is None else change_basis(free, self._method.native_from_basis)
         assert light is not None
         even = wp.full((1, transmittance.shape[2]), wp.vec3(1.0), dtype=wp.vec3, device=diffuse.device)

@@ -19,12 +19,12 @@ from warpshadow.pipeline.methods.glossy_cells import shading_with_cells
 from warpshadow.pipeline.methods.sharpest_cells import SharpestCells, find_share_of_sharpest_light, find_sharpest_cells
 from warpshadow.pipeline.node import Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, Group
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
+from warpshadow.pipeline.receivers.shading_context import BlockerKinds, ShadingContext
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells, project_on_cells
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
-from warpshadow.pipeline.shading.shell_patches import PATCHES, ShellPatches, project_on_shell
+from warpshadow.pipeline.shading.shell_cells import SHELL_BASIS, ShellCells, project_on_shell
 from warpshadow.pipeline.shading.sphere_method import SphereMethod
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT
 from warpshadow.scene.blockers import blocking_planes
@@ -47,16 +47,16 @@ from warpshadow.stages.visibility.sharp_cells import RADII_PER_HALF_ANGLE, Sharp
 class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     """Visibility for each cell of directions by itself."""
 
-    shades_transmittance = True
+    shades_without_transfer = True
 
     def __init__(self, merged_scene: MergedScene, basis: Basis | None, *, progress: bool = False):
         self._directions = fibonacci(merged_scene.scene.direction_count)
         is_near = merged_scene.scene.shell is not None
-        native_basis = PATCHES if is_near else CellBasis(self._directions)
+        native_basis = SHELL_BASIS if is_near else CellBasis(self._directions)
         super().__init__(merged_scene, native_basis, basis, progress=progress)
-        self.widens_edges = not is_near
+        self.edges_as_wide_as_footprints = not is_near
         self.free_basis = ProjectedCells(
-            self._directions, patches=None if self.shell is None else ShellPatches(self.shell)
+            self._directions, shell_cells=None if self.shell is None else ShellCells(self.shell)
         )
 
     def project_light(self, light: KnownLight, shell: wp.array | None = None) -> ProjectedCells:
@@ -65,8 +65,8 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         From a shell light comes to each receiver from other directions: cells are even.
         """
         if shell is not None:
-            patches, radiance = project_on_shell(light, shell)
-            return self.free_basis._replace(patches=patches, coefficients=radiance)
+            shell_cells, radiance = project_on_shell(light, shell)
+            return self.free_basis._replace(shell_cells=shell_cells, coefficients=radiance)
         blockers = self.scene_blockers
         return project_on_cells(
             light,
@@ -79,7 +79,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def free_basis_of_shell(self, shell: wp.array) -> ProjectedCells:
         """The basis of free light of another shell than the scene's. Differentiable: shell."""
-        return self.free_basis._replace(patches=ShellPatches(shell))
+        return self.free_basis._replace(shell_cells=ShellCells(shell))
 
     def coefficient_count(self, light: Input | None) -> int:
         """Number of coefficients that take part: all."""
@@ -214,13 +214,13 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def _transmittance_self(self, group: Group, projected_light: ProjectedCells) -> wp.array | None:
         """Transmittance past the body of the receivers: by its parts, or looked up, and by rays where asked."""
-        if group.own_parts is not None:
-            coverages = self._coverages(group.own_coverage, projected_light)
+        if group.self_blocking_parts is not None:
+            coverages = self._coverages(group.self_coverage, projected_light)
             return self._past_coverages(None, coverages, None, projected_light)
-        transmittance_self, own = group.looked_up_transmittance(), group.own
-        if transmittance_self is None or own is None:
+        transmittance_self, receiver_body = group.looked_up_transmittance(), group.receiver_body
+        if transmittance_self is None or receiver_body is None:
             return None
-        rays = own.lookup.rays
+        rays = receiver_body.lookup.rays
         if rays is None or projected_light.sun is None:
             return transmittance_self
         if transmittance_self.requires_grad:
@@ -228,15 +228,17 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
                 'self_shadows: got "rays" where a pose or a camera has a gradient, which rays under a sun do not '
                 'have, expected "traced" or "spheres"'
             )
-        of_sun = trace_sun_cells(rays[0], own.probe_weights, rays[1], own.number, projected_light.sun)
+        of_sun = trace_sun_cells(
+            rays[0], receiver_body.probe_weights, rays[1], receiver_body.number, projected_light.sun
+        )
         return blend_sharp_cells(transmittance_self, of_sun, projected_light.sun.slots)
 
     def transfer(self, visibility: CellVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Transfer vectors; the transmittance as it is where cached cells hold known light."""
         assert visibility.transmittance_total is not None
-        if projected_light.patches is not None:
+        if projected_light.shell_cells is not None:
             arguments = group.points, group.normals, visibility.transmittance_total, projected_light.blocking_directions
-            return projected_light.patches.transfer(*arguments)
+            return projected_light.shell_cells.transfer(*arguments)
         if group.cached_rows is None:
             return directional_transfer(
                 visibility.transmittance_total, group.normals, projected_light.cosine_directions
@@ -255,7 +257,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         self, visibility: CellVisibility, group: Group, projected_light: ProjectedCells
     ) -> wp.array:
         """Shading of a group in known light."""
-        if group.cached_rows is not None or projected_light.patches is not None:
+        if group.cached_rows is not None or projected_light.shell_cells is not None:
             return super().shade_transmittance(visibility, group, projected_light)
         assert visibility.transmittance_total is not None and projected_light.coefficients is not None
         cells = projected_light.cosine_directions, projected_light.coefficients
@@ -279,7 +281,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         """Visibility in lobes, between cells."""
         return CellLobes(self, self._directions)
 
-    def known_shading(self, points: LitPoints, light: LightInput) -> Node:
+    def known_shading(self, points: ShadingContext, light: LightInput) -> Node:
         """Direct known light on points; where no light bounces, with the cells of bodies that shine."""
         if self.merged_scene.scene.bounces or points.materials.roughness is None:
             return super().known_shading(points, light)

@@ -9,24 +9,24 @@ import warp as wp
 
 from warpshadow.pipeline.node import Call, Node
 from warpshadow.pipeline.receivers.groups import CellVisibility
-from warpshadow.pipeline.receivers.lit_points import LitPoints
+from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells
-from warpshadow.pipeline.shading.sphere_method import LitPortion, PortionedShading, PortionedVisibility, SphereMethod
+from warpshadow.pipeline.shading.sphere_method import LitPortion, ShadingNode, SphereMethod, VisibilityNode
 from warpshadow.pipeline.shading.transfers import join_portions, join_rows
 
 CellMethod = SphereMethod[ProjectedCells, CellVisibility]
 
 
-def shading_with_cells(method: CellMethod, points: LitPoints, light: LightInput) -> Node:
+def shading_with_cells(method: CellMethod, points: ShadingContext, light: LightInput) -> Node:
     """Node of the :class:`ShadingAndTransmittance` of points in known light that does not bounce."""
     make = functools.partial(_ShadingWithCells, method, points, method.projected_light(points, light), light)
     return method.cached_for_light("direct with cells", points, light, make)
 
 
-def transmittance_of_cells(method: CellMethod, points: LitPoints, light: LightInput) -> Node:
+def transmittance_of_cells(method: CellMethod, points: ShadingContext, light: LightInput) -> Node:
     """Node of the transmittance of points towards cells, float32 of shape [batch, receiver, direction]."""
-    arguments = method, points, method.light_of_visibility(points, light), None
+    arguments = method, points, method.visibility_basis(points, light), None
     make = functools.partial(_TransmittanceOfCells, *arguments, suffix=" of gloss")
     return points.cached("cells", light.visibility_key, make)
 
@@ -38,7 +38,7 @@ class ShadingAndTransmittance(NamedTuple):
     transmittance: wp.array  # of receivers on bodies that shine, float32 of shape [batch, receiver, direction]
 
 
-class _ShadingWithCells(PortionedShading):
+class _ShadingWithCells(ShadingNode):
     """Shading of receivers, and the transmittance of cells at bodies that shine."""
 
     def compute(self, call: Call) -> ShadingAndTransmittance:
@@ -54,7 +54,7 @@ class _ShadingWithCells(PortionedShading):
         return portion.result, _transmittance_of(portion) if is_glossy else None
 
 
-class _TransmittanceOfCells(PortionedVisibility):
+class _TransmittanceOfCells(VisibilityNode):
     """Transmittance of receivers towards cells, float32 of shape [batch, receiver, direction]."""
 
     def compute(self, call: Call) -> wp.array:

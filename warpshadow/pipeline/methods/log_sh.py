@@ -15,9 +15,9 @@ from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLobes
 from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Group, HarmonicVisibility
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds
+from warpshadow.pipeline.receivers.shading_context import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
-from warpshadow.pipeline.shading.shell_patches import ShellPatches
+from warpshadow.pipeline.shading.shell_cells import ShellCells
 from warpshadow.pipeline.shading.sphere_method import SphereMethod
 from warpshadow.stages.light.cached_cells import add_rows
 from warpshadow.stages.light.transfer import sh_product, sh_transfer
@@ -25,11 +25,11 @@ from warpshadow.stages.visibility import exponential, log_sh
 
 
 class ProjectedBands(NamedTuple):
-    """Light in bands of spherical harmonics; or in patches of a shell, which the method "none" has."""
+    """Light in bands of spherical harmonics; or in cells of a shell, which the method "none" has."""
 
-    bands: int  # 0 of patches
+    bands: int  # 0 of cells of a shell
     coefficients: wp.array | None = None  # of known light, vec3 of shape [1, bands²], or [1, patch]
-    patches: ShellPatches | None = None  # that send the light, whose coefficients are theirs; None where it is far
+    shell_cells: ShellCells | None = None  # that send the light, whose coefficients are theirs; None where it is far
 
     def with_coefficients(self, coefficients: wp.array) -> "ProjectedBands":
         """Light of the same basis."""
@@ -103,10 +103,12 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
             lobes = zeros(visibility.coefficients.shape, dtype=wp.float32, device=visibility.coefficients.device)
             add_rows(group.cached_rows, lobes, channel=1)
             return lobes
-        if group.own is None or group.own.lookup is None or not group.points.size:
+        if group.receiver_body is None or group.receiver_body.lookup is None or not group.points.size:
             return None
         bands = projected_light.bands if visibility.coefficients is None else self._order
-        return group.own.lookup.of_receivers(group.own.probe_weights, order=self._order, bands=bands)
+        return group.receiver_body.lookup.of_receivers(
+            group.receiver_body.probe_weights, order=self._order, bands=bands
+        )
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """The log-visibility of the static spheres, for any light, [row, 1, order²]; and lobes, if one has its own."""

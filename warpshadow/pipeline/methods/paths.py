@@ -11,12 +11,12 @@ from warpshadow.device.memory import empty
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
-from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
+from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
 from warpshadow.stages.light.light_samples import sample_map
 from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.ray_traced.path_tracing import PathSurfaces, trace_bounces
 from warpshadow.stages.receivers.find import Receivers
-from warpshadow.stages.shell.beams import FAR
+from warpshadow.stages.shell.shell_rays import FAR
 from warpshadow.stages.textures.pyramid import Textures
 
 if TYPE_CHECKING:  # it is imported where bodies emit
@@ -33,7 +33,7 @@ _RAYS_OF_PATH = 2
 def path_traced(
     direct: Node,
     meshes: Node,
-    points: LitPoints,
+    points: ShadingContext,
     light: Input,
     shell: Input | wp.array | None,
     materials: Materials,

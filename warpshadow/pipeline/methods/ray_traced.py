@@ -11,8 +11,8 @@ from warpshadow.assets.basis import Basis, CellBasis, HarmonicBasis
 from warpshadow.assets.known_light import KnownLight
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
-from warpshadow.pipeline.node import Input, Node, NodeStage, detached
-from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
+from warpshadow.pipeline.node import ExplainRow, Input, Node, detached
+from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.lobe_light import LitLobes, LobeVisibility
 from warpshadow.pipeline.shading.method import Method
@@ -24,7 +24,7 @@ from warpshadow.stages.ray_traced.traced_transfer import trace_transfer
 from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, build_face_tree
 from warpshadow.stages.rays.ray_tracing import trace_shading
 from warpshadow.stages.receivers.find import Receivers
-from warpshadow.stages.shell.beams import FAR, check_within
+from warpshadow.stages.shell.shell_rays import FAR, check_within
 
 if TYPE_CHECKING:  # it is imported where bodies emit
     from warpshadow.stages.emitters.samples import PlacedSamples
@@ -44,7 +44,7 @@ class RayTraced(Method):
         super().__init__(merged_scene, HarmonicBasis(merged_scene.scene.visibility.order), basis, progress=progress)
         self.shares_directions = self.visibility.sampling == "shared"
 
-    def known_shading(self, points: LitPoints, light: LightInput) -> Node:
+    def known_shading(self, points: ShadingContext, light: LightInput) -> Node:
         """Direct known light on points, towards which rays are drawn."""
         return Node(
             f"shading{points.suffix}",
@@ -54,10 +54,10 @@ class RayTraced(Method):
             light,
             self.shell_of(light),
             items=functools.partial(receiver_text, points.weak),
-            stages=(NodeStage("transfer", idle="rays shade known light at once"),),
+            stages=(ExplainRow("transfer", idle="rays shade known light at once"),),
         )
 
-    def along_paths(self, direct: Node, points: LitPoints, light: LightInput, materials: Materials) -> Node:
+    def along_paths(self, direct: Node, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Shading of points in known light that bounces along paths, which have no gradient."""
         from warpshadow.pipeline.methods.paths import path_traced
 
@@ -65,17 +65,17 @@ class RayTraced(Method):
         arguments = direct, self._meshes(points), points, light, self.shell_of(light), materials, emitters
         return path_traced(*arguments, samples=self._sample_count, progress=self.progress)
 
-    def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
+    def emitted_light(self, points: ShadingContext, materials: Materials) -> Node:
         """Direct light of emitters on points, by rays to their samples. Differentiable: emission."""
         name = f"light of emitters{points.suffix}"
         return Node(name, self.emitters.traced_light, *self._rays_to_emitters(points, materials))
 
-    def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
+    def highlights(self, points: ShadingContext, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, by rays to their samples."""
         rays = self._rays_to_emitters(points, materials)
         return Node("highlights", self.emitters.traced_highlights, *rays, roughness, cameras)
 
-    def _rays_to_emitters(self, points: LitPoints, materials: Materials) -> tuple[Node, Node, Node, Node]:
+    def _rays_to_emitters(self, points: ShadingContext, materials: Materials) -> tuple[Node, Node, Node, Node]:
         """Receivers, samples, their radiance, and the transmittance between."""
         receivers, samples = points.receivers_node, self.emitters.samples_node(points)
 
@@ -109,7 +109,7 @@ class RayTraced(Method):
         """Visibility in lobes, by rays."""
         return TracedLobes(self)
 
-    def transfers(self, points: LitPoints, shell: Input | None) -> Node:
+    def transfers(self, points: ShadingContext, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
         weak_points = points.weak
         node = Node(
@@ -124,7 +124,7 @@ class RayTraced(Method):
             node.function = _refuse
         return node
 
-    def trees_around(self, points: LitPoints) -> Node:
+    def trees_around(self, points: ShadingContext) -> Node:
         """Node of the trees of all vertices around points."""
         name, vertices = "visibility" if self.shares_directions else "", points.vertices
         items = f"{len(self.merged_scene.body_of_face):,} faces"
@@ -136,7 +136,7 @@ class RayTraced(Method):
         faces = merged_scene.faces.numpy()[np.isin(merged_scene.body_of_face, merged_scene.casting)]
         return [build_face_tree(item, faces, merged_scene.device) for item in positions.numpy()]
 
-    def _meshes(self, points: LitPoints) -> Node:
+    def _meshes(self, points: ShadingContext) -> Node:
         """Node of the meshes that rays from points meet."""
 
         def meshes() -> Node:
@@ -149,7 +149,7 @@ class RayTraced(Method):
                 items=lambda: f"{receiver_text(weak_points)} by rays",
                 idle="" if self.merged_scene.casting else "no body has blockers",
                 caches=False,
-                stages=(NodeStage("static shadows", idle="rays treat all receivers alike"),),
+                stages=(ExplainRow("static shadows", idle="rays treat all receivers alike"),),
             )
 
         return points.cached("meshes", None, meshes)
@@ -183,16 +183,14 @@ class RayTraced(Method):
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
         batches = traced, trees, points, receivers.normals, shells
         for instance, (result, tree, origins, normals, own_shell) in enumerate(_instances(*batches)):
-            lit_points, options = (tree, origins, normals), {"shell": own_shell}
+            arguments, options = (tree, origins, normals), {"shell": own_shell}
             # a ratio image has the same directions with the bodies and without
-            pilots = (
-                None if self.merged_scene.scene.catchers else functools.partial(find_shares, *lit_points, **options)
-            )
+            pilots = None if self.merged_scene.scene.catchers else functools.partial(find_shares, *arguments, **options)
             samples = cut_map(light.radiance, count, pilots)
             corners = None
             if receivers.fragments.face_ids.ndim == 3:  # of an image
                 corners = find_corners(receivers, instance, self.merged_scene.scene.supersampling)
-            wp.copy(result, trace_shared(*lit_points, samples, corners=corners, progress=self.progress, **options))
+            wp.copy(result, trace_shared(*arguments, samples, corners=corners, progress=self.progress, **options))
         return traced
 
     def _transfer(self, meshes: Meshes, receivers: Receivers, shell: wp.array | None = None) -> list[wp.array]:

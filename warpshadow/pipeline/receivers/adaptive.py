@@ -15,7 +15,7 @@ from warpshadow.device.constants import immutable
 from warpshadow.device.launch import without_gradient
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.receivers.groups import Blockers, Group
-from warpshadow.pipeline.receivers.lit_points import AdaptiveSurfaces
+from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces
 from warpshadow.stages.receivers.find import points_of_fragments
 from warpshadow.stages.receivers.quadtree import Quadtree, find_quadtree, probe_grid
 from warpshadow.stages.receivers.sample_receivers import fragments_of_samples

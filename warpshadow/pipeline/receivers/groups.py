@@ -17,7 +17,7 @@ from warpshadow.pipeline.bodies.convex import GroupConvexParts, SceneConvexParts
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.scene_planes import GroupPlanes, ScenePlanes
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds
+from warpshadow.pipeline.receivers.shading_context import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.stages.convex.convex_blockers import PlacedParts
 from warpshadow.stages.light.cached_cells import CachedRows
@@ -56,7 +56,7 @@ class BodySides:
 
 
 @dataclass(frozen=True, eq=False)
-class OwnBody:
+class ReceiverBody:
     """The body on which the receivers of a group lie, which may block their light."""
 
     span: Span  # which receivers these are
@@ -77,7 +77,7 @@ class OwnBody:
         """Where on it they lie."""
         return self.self_visibility.probe_weights(self.receivers, self.span)
 
-    def cut(self, receivers: slice) -> OwnBody:
+    def cut(self, receivers: slice) -> ReceiverBody:
         """Select some receivers."""
         first = self.span.first
         return replace(self, span=self.span._replace(first=first + receivers.start, end=first + receivers.stop))
@@ -92,7 +92,7 @@ class Group:
     centers: wp.array  # [batch, sphere] vec3
     radii: wp.array  # [batch, sphere] float32
     cached_rows: CachedRows | None = None  # of static bodies, which block their light, too
-    own: OwnBody | None = None  # where bodies are told apart
+    receiver_body: ReceiverBody | None = None  # where bodies are told apart
     planes: GroupPlanes | None = None  # bodies that block as planes; None without any
     convex_parts_around: GroupConvexParts | None = None  # bodies that block as convex parts; None without any
     nearest_blockers: NearestBlockers | None = None  # None where receivers are not patch samples
@@ -108,23 +108,23 @@ class Group:
     @property
     def body(self) -> int | None:
         """The body whose receivers they are, where bodies are told apart."""
-        return None if self.own is None else self.own.number
+        return None if self.receiver_body is None else self.receiver_body.number
 
     @property
-    def own_parts(self) -> GroupConvexParts | None:
+    def self_blocking_parts(self) -> GroupConvexParts | None:
         """Convex parts of the receivers' own body that block their light; None without any."""
-        return None if self.own is None or not self.points.size else self.own.parts
+        return None if self.receiver_body is None or not self.points.size else self.receiver_body.parts
 
-    def own_coverage(self, directions: np.ndarray, radius: float | None = None) -> wp.array:
+    def self_coverage(self, directions: np.ndarray, radius: float | None = None) -> wp.array:
         """Coverage of cells by them."""
-        assert self.own_parts is not None
-        return self.own_parts.coverage(self.points, self.normals, directions, radius)
+        assert self.self_blocking_parts is not None
+        return self.self_blocking_parts.coverage(self.points, self.normals, directions, radius)
 
     def looked_up_transmittance(self) -> wp.array | None:
         """Transmittance past the receivers' own body, looked up, [batch, receiver, cell]; None without rows."""
-        if self.own is None or self.own.lookup is None or not self.points.size:
+        if self.receiver_body is None or self.receiver_body.lookup is None or not self.points.size:
             return None
-        return self.own.lookup.transmittance(self.normals, self.own.probe_weights)
+        return self.receiver_body.lookup.transmittance(self.normals, self.receiver_body.probe_weights)
 
     @functools.cached_property
     def fronts_of_planes(self) -> PlaneFronts:
@@ -134,9 +134,9 @@ class Group:
 
     def find_fronts(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> PlaneFronts:
         """Which part of each plane's front the receivers see, and the receivers lifted off planes they lie in."""
-        body_sides = None if self.own is None else self.own.body_sides
+        body_sides = None if self.receiver_body is None else self.receiver_body.body_sides
         sides = None if body_sides is None else body_sides.sides_of(frames, planes)
-        body = 0 if self.own is None else self.own.number
+        body = 0 if self.receiver_body is None else self.receiver_body.number
         arguments = self.points, self.normals, sides, self.nearest_blockers, frames, planes
         return find_fronts(*arguments, body=body, skip=skip)
 
@@ -145,11 +145,13 @@ class Group:
 
         For a gradient all of them come at once, and so do receivers with cached rows.
         """
-        own, planes, clusters = self.own, self.planes, self.clusters
-        rotation_data = None if own is None or own.lookup is None else own.lookup.turned
-        positions = None if own is None or own.body_sides is None else own.body_sides.positions
+        receiver_body, planes, clusters = self.receiver_body, self.planes, self.clusters
+        rotation_data = None if receiver_body is None or receiver_body.lookup is None else receiver_body.lookup.turned
+        positions = (
+            None if receiver_body is None or receiver_body.body_sides is None else receiver_body.body_sides.positions
+        )
         frames = None if planes is None else planes.frames
-        parts = self.convex_parts_around or (None if own is None else own.parts)
+        parts = self.convex_parts_around or (None if receiver_body is None else receiver_body.parts)
         part_corners = None if parts is None else parts.placed_parts.corners
         arguments = points, normals, centers, radii = self.points, self.normals, self.centers, self.radii
         others = {"rotations": rotation_data, "planes": frames, "positions": positions, "parts": part_corners}
@@ -172,7 +174,7 @@ class Group:
                 normals=normals[:, portion].contiguous(),
                 centers=centers,
                 radii=radii,
-                own=None if own is None else own.cut(portion),
+                receiver_body=None if receiver_body is None else receiver_body.cut(portion),
                 footprints=None if footprints is None else footprints[:, portion].contiguous(),
                 nearest_blockers=None if self.nearest_blockers is None else self.nearest_blockers.cut(portion),
                 clusters=clusters,
@@ -251,7 +253,7 @@ class Blockers(NamedTuple):
             return None
         return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed_parts, skip)
 
-    def own_parts(self, body: int) -> GroupConvexParts | None:
+    def self_blocking_parts(self, body: int) -> GroupConvexParts | None:
         """The convex parts of a body, where they block its own light: one alone does not."""
         bodies = self.blocker_kinds.convex
         if self.placed_parts is None or body not in self.blocker_kinds.solids or len(self.parts.parts[body]) == 1:
@@ -291,7 +293,7 @@ def find_portions(
         self_lookups: Self-visibility of receivers, by body; None without any.
         cached_rows: Cached transmittance past static bodies, for receivers on them.
         static_normals: Normals of all vertices of static bodies; None where any may move.
-        static_bodies, nearest_spheres: As of the :class:`LitPoints` that they are.
+        static_bodies, nearest_spheres: As of the :class:`ShadingContext` that they are.
     """
     if static_bodies is not None and len(receivers.static_vertices):
         assert static_normals is not None
@@ -340,16 +342,16 @@ def _groups_that_move(
             clusters = clusters or find_clusters(*spheres, blockers.merging)
             group = replace(group, skip=skip, clusters=clusters)
         if span.body >= 0:
-            own = OwnBody(
+            receiver_body = ReceiverBody(
                 span,
                 receivers,
                 blockers.self_visibility,
                 self_lookups.get(span.body),
                 span.body in blockers.blocker_kinds.solids,
-                blockers.own_parts(span.body),
+                blockers.self_blocking_parts(span.body),
                 blockers.body_sides,
             )
-            group = replace(group, own=own)
+            group = replace(group, receiver_body=receiver_body)
         if nearest_blockers is not None:
             group = replace(group, nearest_blockers=nearest_blockers.cut(slice(span.first, span.end)))
         yield group

@@ -5,7 +5,7 @@ from collections.abc import Hashable
 import numpy as np
 
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds
+from warpshadow.pipeline.receivers.shading_context import ONLY_SPHERES, BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.stages.receivers.find import Numbering, number_receivers
 

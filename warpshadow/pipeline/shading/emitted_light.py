@@ -12,7 +12,6 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.receivers.groups import Blockers, Group
 from warpshadow.pipeline.shading.transfers import join_portions
-from warpshadow.stages.emitters.beams import weigh_by_beam
 from warpshadow.stages.emitters.convex_transmittance import find_log_transmittance_of_parts
 from warpshadow.stages.emitters.emitter_self_visibility import EmitterSelfVisibility, look_up_self_visibility
 from warpshadow.stages.emitters.light import (
@@ -24,6 +23,7 @@ from warpshadow.stages.emitters.light import (
 from warpshadow.stages.emitters.plane_transmittance import find_log_transmittance_of_planes
 from warpshadow.stages.emitters.samples import EmitterSamples, EmitterSpan, PlacedSamples
 from warpshadow.stages.emitters.sphere_transmittance import find_log_transmittance
+from warpshadow.stages.emitters.spot_cones import weigh_by_beam
 from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.gloss.transmittance import interpolate_transmittance
@@ -112,8 +112,8 @@ def _find_transmittances(
     if not points.size:
         return
     transmittance_of_cells = (
-        transmittance_past(None, group.own_coverage(EMITTER_CELLS))
-        if group.own_parts is not None
+        transmittance_past(None, group.self_coverage(EMITTER_CELLS))
+        if group.self_blocking_parts is not None
         else group.looked_up_transmittance()
     )
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)

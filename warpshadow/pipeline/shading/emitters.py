@@ -21,9 +21,8 @@ from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Clock, Node
-from warpshadow.pipeline.receivers.lit_points import LitPoints
+from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.stages.bounces.albedo import mean_over_texels
-from warpshadow.stages.emitters.beams import find_axis_weights, weigh_by_beam
 from warpshadow.stages.emitters.emitter_self_visibility import EmitterSelfVisibility, find_self_visibility
 from warpshadow.stages.emitters.light import sum_light
 from warpshadow.stages.emitters.samples import (
@@ -37,6 +36,7 @@ from warpshadow.stages.emitters.samples import (
     place_samples,
 )
 from warpshadow.stages.emitters.shown_beams import show_beams
+from warpshadow.stages.emitters.spot_cones import find_axis_weights, weigh_by_beam
 from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.light.sums import add_light
@@ -158,7 +158,7 @@ class SceneEmitters:
             total += light.numpy()[0] @ LUMINANCE
         return total
 
-    def samples_node(self, points: LitPoints) -> Node:
+    def samples_node(self, points: ShadingContext) -> Node:
         """Node of the samples among the bodies around points."""
         return points.cached_of_bodies("emitters", None, lambda: Node("", self._place, points.vertices))
 

@@ -16,7 +16,7 @@ from warpshadow.device.batch import rows
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node, field_of
-from warpshadow.pipeline.receivers.lit_points import receiver_text
+from warpshadow.pipeline.receivers.shading_context import receiver_text
 from warpshadow.pipeline.shading.glossy_points import GlossyPoints
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.lobe_light import LitLobes
@@ -33,7 +33,7 @@ from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.receivers.sample_receivers import MAX_SHARED_SAMPLES, places_in_pixels
-from warpshadow.stages.shell.beams import exits_from_shell
+from warpshadow.stages.shell.shell_rays import exits_from_shell
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.numbers import as_colors, as_scalars, average_over_receivers
 from warpshadow.stages.textures.pyramid import Textures

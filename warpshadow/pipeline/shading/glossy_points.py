@@ -10,14 +10,14 @@ import warp as wp
 from warpshadow.device.batch import concatenate, cut
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.node import Input, Node, detached
-from warpshadow.pipeline.receivers.lit_points import LitPoints
+from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.stages.gloss.reflection import number_runs
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.receivers.sample_receivers import Span
 
 
-class GlossyPoints(LitPoints):
+class GlossyPoints(ShadingContext):
     """The receivers of a view on bodies that shine; pixels see them all.
 
     Args:
@@ -29,7 +29,7 @@ class GlossyPoints(LitPoints):
         numbers: Node of the numbers of glossy ones among these, −1 for diffuse ones, int32 of shape [receiver].
     """
 
-    def __init__(self, view: LitPoints, cameras: Input, fragments: Node, clip_positions: Node):
+    def __init__(self, view: ShadingContext, cameras: Input, fragments: Node, clip_positions: Node):
         glossy = view.merged_scene.is_glossy
         self.all_receivers, self.cameras = view.receivers_node, cameras
         self.fragments, self.clip_positions = fragments, clip_positions

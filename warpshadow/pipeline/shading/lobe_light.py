@@ -11,7 +11,7 @@ from warpshadow.device.batch import expand
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.node import Node, field_of
-from warpshadow.pipeline.receivers.lit_points import LitPoints
+from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.shading.glossy_points import GlossyPoints
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.stages.gloss.prefilter import prefilter
@@ -26,7 +26,7 @@ class LitLobes(NamedTuple):
 
     points: GlossyPoints
     light: LightInput  # known or free, which says where shadows have to be sharp
-    all_points: LitPoints  # the receivers of the image, among which they are
+    all_points: ShadingContext  # the receivers of the image, among which they are
 
 
 class LobeVisibility:
@@ -71,7 +71,7 @@ class LobeVisibility:
         """Number of samples of the lobe of a receiver."""
         return max(self.sample_count // self.receivers_across**2, min(self.sample_count, _MIN_SAMPLES))
 
-    def _cached(self, name: str, points: LitPoints, light: LightInput, make: Callable[[], Node]) -> Node:
+    def _cached(self, name: str, points: ShadingContext, light: LightInput, make: Callable[[], Node]) -> Node:
         """A node of known light, cached for the scene's light and, with points, for the last other one."""
         if light is not self._scene_light:
             return points.cached(name, light, make)
@@ -79,18 +79,18 @@ class LobeVisibility:
             self._of_scene[name] = make()
         return self._of_scene[name]
 
-    def _separated(self, points: LitPoints, light: LightInput) -> Node | None:
+    def _separated(self, points: ShadingContext, light: LightInput) -> Node | None:
         """Node of known light that is separated from its suns; None for light whose suns are not separated."""
         if light.is_free or self._merged_scene.scene.shell is not None:
             return None
         return self._cached("separated light", points, light, lambda: Node("", _separate_suns, light))
 
-    def suns(self, points: LitPoints, light: LightInput) -> Node | None:
+    def suns(self, points: ShadingContext, light: LightInput) -> Node | None:
         """Node of the suns of known light, which prefiltered light is without; None for other light."""
         separated = self._separated(points, light)
         return None if separated is None else field_of(separated, "suns")
 
-    def prefiltered(self, points: LitPoints, light: LightInput, *, with_suns: bool = False) -> Node:
+    def prefiltered(self, points: ShadingContext, light: LightInput, *, with_suns: bool = False) -> Node:
         """Node of known light, by default without its suns, prefiltered, vec3 [1, texel]."""
         separated = self._separated(points, light)
         name = "prefiltered light with suns" if with_suns and separated is not None else "prefiltered light"

@@ -17,17 +17,17 @@ from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
-from warpshadow.pipeline.receivers.lit_points import (
+from warpshadow.pipeline.receivers.shading_context import (
     ONLY_SPHERES,
     AdaptiveSurfaces,
     BlockerKinds,
-    LitPoints,
+    ShadingContext,
     receiver_text,
 )
 from warpshadow.pipeline.shading.light_input import LightInput
-from warpshadow.pipeline.shading.transfers import Light, check_light, shade_free
+from warpshadow.pipeline.shading.transfers import LightArgument, check_light, shade_free
 from warpshadow.stages.receivers.quadtree import Quadtree
-from warpshadow.stages.shell.beams import check_shell, shell_array
+from warpshadow.stages.shell.shell_rays import check_shell, shell_array
 
 if TYPE_CHECKING:  # they are imported where a body emits, or shines
     from warpshadow.pipeline.shading.emitters import SceneEmitters
@@ -62,7 +62,7 @@ class Method(abc.ABC):
         basis: Basis of free light; None for the method's own.
     """
 
-    widens_edges = False  # whether edges of a sun's shadow on flat bodies are as wide as receivers' footprints
+    edges_as_wide_as_footprints = False  # edges of a sun's shadow on flat bodies are as wide as receivers' footprints
 
     shares_directions = False
     """Whether all receivers look for light in the same directions, so that one is enough for a surface in a pixel."""
@@ -102,16 +102,16 @@ class Method(abc.ABC):
 
         return SceneEmitters(self.merged_scene)
 
-    def light_of_emitters(self, points: LitPoints, materials: Materials) -> Node:
+    def light_of_emitters(self, points: ShadingContext, materials: Materials) -> Node:
         """Direct light of emitters on points, vec3 of shape [batch, receiver], cached for the last emission."""
         return points.cached("emitted", materials.emission, lambda: self.emitted_light(points, materials))
 
     @abc.abstractmethod
-    def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
+    def emitted_light(self, points: ShadingContext, materials: Materials) -> Node:
         """Direct light of emitters on points, past the blockers between, vec3 of shape [batch, receiver]."""
 
     @abc.abstractmethod
-    def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
+    def highlights(self, points: ShadingContext, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, past the blockers between: G and G', vec3 [batch, receiver].
 
         Args:
@@ -121,7 +121,9 @@ class Method(abc.ABC):
             cameras: Clip matrices.
         """
 
-    def light_input(self, points: LitPoints, light: Light | None, shell: wp.array | None = None) -> LightInput:
+    def light_input(
+        self, points: ShadingContext, light: LightArgument | None, shell: wp.array | None = None
+    ) -> LightInput:
         """The light of an image, or of other points, as an input, checked; the same for the same known light and shell.
 
         Args:
@@ -141,7 +143,7 @@ class Method(abc.ABC):
         why_new = "" if points.last_cached("light") is None else "light changed since the last call"
         return points.cached("light", (known, shell_input), lambda: LightInput(known, shell_input, why_new=why_new))
 
-    def _shell_input(self, points: LitPoints, light: Light | None, shell: wp.array | None) -> Input | None:
+    def _shell_input(self, points: ShadingContext, light: LightArgument | None, shell: wp.array | None) -> Input | None:
         """The shell of light that is not the scene's, the same while its values are; None for the scene's."""
         if isinstance(light, EnvironmentMap) and light.shell is not None and shell is None:
             shell = shell_array(light.shell, self.merged_scene.device)
@@ -160,7 +162,7 @@ class Method(abc.ABC):
         """Center and radius of the sphere that sends light, vec4 of shape [batch]; None for light infinitely far."""
         return self.shell if light.shell is None else light.shell
 
-    def cached_transfers(self, points: LitPoints, shell: Input | None = None) -> Node:
+    def cached_transfers(self, points: ShadingContext, shell: Input | None = None) -> Node:
         """Transfer vectors of points to :attr:`basis`, an array [batch, receiver, coefficient] for each group.
 
         Args:
@@ -168,12 +170,12 @@ class Method(abc.ABC):
         """
         return points.cached("transfers", shell, lambda: self.transfers(points, shell))
 
-    def cached_for_light(self, name: str, points: LitPoints, light: LightInput, make: Callable[[], Node]) -> Node:
+    def cached_for_light(self, name: str, points: ShadingContext, light: LightInput, make: Callable[[], Node]) -> Node:
         """A node of points in known light, cached for the scene's light and for the last other one."""
         name = f"{name} of the scene" if light is self.light else name
         return points.cached(name, light, make)
 
-    def direct_shading(self, points: LitPoints, light: LightInput) -> Node:
+    def direct_shading(self, points: ShadingContext, light: LightInput) -> Node:
         """Direct light that points reflect as white surfaces, without that of emitters, vec3 [batch, receiver].
 
         Known light is shaded at once; free light meets transfer vectors, which are cached.
@@ -183,10 +185,10 @@ class Method(abc.ABC):
         return self.cached_for_light("direct", points, light, lambda: self.known_shading(points, light))
 
     @abc.abstractmethod
-    def known_shading(self, points: LitPoints, light: LightInput) -> Node:
+    def known_shading(self, points: ShadingContext, light: LightInput) -> Node:
         """Direct known light on points."""
 
-    def _free_shading(self, points: LitPoints, light: LightInput) -> Node:
+    def _free_shading(self, points: ShadingContext, light: LightInput) -> Node:
         """Direct free light on points, which is converted where the transfer vectors are not."""
         transfers = self.cached_transfers(points, light.shell)
         matrix = self.native_from_basis if transfers.requires_grad else None
@@ -203,7 +205,7 @@ class Method(abc.ABC):
         return conversion(basis, native)
 
     @abc.abstractmethod
-    def transfers(self, points: LitPoints, shell: Input | None) -> Node:
+    def transfers(self, points: ShadingContext, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, an array for each group, for light from a shell."""
 
     @functools.cached_property
@@ -213,10 +215,10 @@ class Method(abc.ABC):
 
         return LobeVisibility(self.merged_scene, self.light, shares_receivers=self.shares_lobes)
 
-    def along_paths(self, direct: Node, points: LitPoints, light: LightInput, materials: Materials) -> Node:
+    def along_paths(self, direct: Node, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Shading of points in known light that bounces along paths, added to direct light."""
         raise NotImplementedError
 
-    def openness(self, points: LitPoints) -> Node | None:
+    def openness(self, points: ShadingContext) -> Node | None:
         """Light that points reflect as white surfaces under an even sky of 1; None where rays find it on average."""
         return None

@@ -12,14 +12,14 @@ from warpshadow.device.constants import constant
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node, detached, field_of
-from warpshadow.pipeline.receivers.lit_points import LitPoints, receiver_text
+from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
 from warpshadow.stages.gloss.lobe_hits import LobeHits, trace_hits
 from warpshadow.stages.gloss.mirrored import mirror, mix_mirrored
 from warpshadow.stages.receivers.find import Receivers
 
 
 def find_mirrored_radiance(
-    points: LitPoints,
+    points: ShadingContext,
     materials: Materials,
     samples: Node,
     transmittance: Node,

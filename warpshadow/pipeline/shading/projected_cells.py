@@ -12,7 +12,7 @@ from warpshadow.assets.cells import draw_in_cells, gather_cells, without_spots
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.constants import constant
-from warpshadow.pipeline.shading.shell_patches import ShellPatches
+from warpshadow.pipeline.shading.shell_cells import ShellCells
 from warpshadow.stages.planes.partial_cells import SAMPLES
 from warpshadow.stages.self_visibility.sun_cells import SunCells, find_sun_cells
 from warpshadow.stages.visibility.sharp_cells import MAX_RADIUS_PAST_PLANES, SharpCells, find_sharp_cells
@@ -45,7 +45,7 @@ class ProjectedCells(NamedTuple):
     spot_shares: np.ndarray | None = None  # share of the light of sharp cells that their spot has [direction]
     samples: np.ndarray | None = None  # even ones in cells without light [direction, 8, 3]
     sun: SunCells | None = None  # the brightest cells, where bodies want rays to them
-    patches: ShellPatches | None = None  # of near light: coefficients are then radiances of these, not of cells
+    shell_cells: ShellCells | None = None  # of near light: coefficients are then radiances of these, not of cells
 
     @property
     def cosine_directions(self) -> np.ndarray:

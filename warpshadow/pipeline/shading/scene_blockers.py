@@ -13,8 +13,8 @@ from warpshadow.pipeline.bodies.scene_planes import ScenePlanes
 from warpshadow.pipeline.bodies.self_visibility import FREE_SHAPE, SelfVisibility
 from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Blockers, BodySides
-from warpshadow.pipeline.receivers.lit_points import ONLY_SPHERES, BlockerKinds, LitPoints, receiver_text
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
+from warpshadow.pipeline.receivers.shading_context import ONLY_SPHERES, BlockerKinds, ShadingContext, receiver_text
 from warpshadow.scene.blockers import why_spheres_block
 
 
@@ -112,7 +112,7 @@ class SceneBlockers:
             counts[body] = len(self.parts.parts[body])
         return counts
 
-    def pairs_with(self, points: LitPoints) -> str:
+    def pairs_with(self, points: ShadingContext) -> str:
         """Receivers and the spheres and convex parts that block them, in words."""
         spheres, parts = self._sphere_counts(points.blocker_kinds), self._part_counts(points.blocker_kinds)
 

@@ -14,9 +14,9 @@ from warpshadow.device.constants import Identity
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
-from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached
+from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached
 from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_portions
-from warpshadow.pipeline.receivers.lit_points import AdaptiveSurfaces, BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, BlockerKinds, ShadingContext, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.method import Method
@@ -66,21 +66,21 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     | :attr:`emitter_cells` | lamps, past the self-visibility of receivers | None: without it |
     | :meth:`share_of_sharpest_light` | adaptive receivers | None, as where nothing blocks |
 
-    :class:`PortionedVisibility` calls find_visibility, then find_visibility_past_planes; :class:`PortionedTransfer`
-    goes on with transfer, and :class:`PortionedShading` with that and shade_transfer, or with shade_transmittance.
+    :class:`VisibilityNode` calls find_visibility, then find_visibility_past_planes; :class:`TransferNode`
+    goes on with transfer, and :class:`ShadingNode` with that and shade_transfer, or with shade_transmittance.
 
     Attributes:
         free_basis: The basis in which the method projects any free light, of the scene's shell if it has one.
         why_no_shadows: Why the method has no shadows, in words; empty if it has.
         adds_cached_rows: Whether visibility combines cached rows with moving blockers.
-        shades_transmittance: Whether known light is summed from transmittance directly (:meth:`shade_transmittance`).
+        shades_without_transfer: Whether known light is summed from transmittance directly, :meth:`shade_transmittance`.
             No transfer vectors are then stored, but for cached rows and light from a shell.
     """
 
     free_basis: Projected
     why_no_shadows = ""
     adds_cached_rows = False
-    shades_transmittance = False
+    shades_without_transfer = False
 
     @property
     def emitter_cells(self) -> Projected | None:
@@ -124,20 +124,20 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     def _projected_scene_light(self) -> Node:
         return Node("", self.project_light, self.light, self.shell)
 
-    def projected_light(self, points: LitPoints, light: LightInput) -> Node:
+    def projected_light(self, points: ShadingContext, light: LightInput) -> Node:
         """Node of light on points, projected for the method; the same for the same known light."""
         if light.is_free:
-            return Node("", self._with_free_light, light, self.light_of_visibility(points, light))
+            return Node("", self._with_free_light, light, self.visibility_basis(points, light))
         if light is self.light:
             return self._projected_scene_light
         make = functools.partial(Node, "", self.project_light, light, self.shell_of(light))
         return points.cached_of_bodies("projected", light, make)
 
-    def light_of_visibility(self, points: LitPoints, light: LightInput) -> Node | Projected:
+    def visibility_basis(self, points: ShadingContext, light: LightInput) -> Node | Projected:
         """The light by which visibility is found, projected: known light, or any free light of the same shell."""
         return self.free_basis_of(points, light.shell) if light.is_free else self.projected_light(points, light)
 
-    def free_basis_of(self, points: LitPoints, shell: Input | None) -> Node | Projected:
+    def free_basis_of(self, points: ShadingContext, shell: Input | None) -> Node | Projected:
         """The basis in which the method projects free light, or a node of it, the same for the same shell."""
         if shell is None:
             return self.free_basis
@@ -154,7 +154,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
 
     @abc.abstractmethod
     def self_lookups(self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Projected) -> dict[int, Any]:
-        """Self-visibility of receivers of some bodies, :attr:`.OwnBody.lookup` by body. Differentiable: rotations."""
+        """Self-visibility of receivers of some bodies, :attr:`.ReceiverBody.lookup`. Differentiable: rotations."""
 
     @abc.abstractmethod
     def find_visibility(self, group: Group, projected_light: Projected) -> FoundVisibility:
@@ -192,20 +192,20 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of transmittance past static bodies, for known light or for any."""
 
-    def emitted_light(self, points: LitPoints, materials: Materials) -> Node:
+    def emitted_light(self, points: ShadingContext, materials: Materials) -> Node:
         """Direct light of emitters on points, by the same blockers."""
         from warpshadow.pipeline.shading.emitted_light import find_emitted_light
 
         return self._sum_over_emitters("light of emitters", find_emitted_light, points, materials)
 
-    def highlights(self, points: LitPoints, materials: Materials, roughness: Node, cameras: Input) -> Node:
+    def highlights(self, points: ShadingContext, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, by the same blockers."""
         from warpshadow.pipeline.shading.emitted_light import find_highlights
 
         return self._sum_over_emitters("highlights", find_highlights, points, materials, roughness, cameras)
 
     def _sum_over_emitters(
-        self, name: str, find: Callable[..., Any], points: LitPoints, materials: Materials, *others: Node | Input
+        self, name: str, find: Callable[..., Any], points: ShadingContext, materials: Materials, *others: Node | Input
     ) -> Node:
         emitters, weak_points = self.emitters, points.weak
         portions_of = _find_portions_of(points)
@@ -233,22 +233,22 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
             items=lambda: f"{receiver_text(weak_points)} × {emitters.samples.first[-1]} samples",
         )
 
-    def known_shading(self, points: LitPoints, light: LightInput) -> Node:
+    def known_shading(self, points: ShadingContext, light: LightInput) -> Node:
         """Direct known light on points."""
-        return PortionedShading(self, points, self.projected_light(points, light), light)
+        return ShadingNode(self, points, self.projected_light(points, light), light)
 
-    def openness(self, points: LitPoints) -> Node:
+    def openness(self, points: ShadingContext) -> Node:
         """Light that points reflect as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
         sky = LightInput(EnvironmentMap.constant(1.0))
-        return PortionedShading(self, points, Node("", self.project_light, sky), sky, suffix=" in an even sky")
+        return ShadingNode(self, points, Node("", self.project_light, sky), sky, suffix=" in an even sky")
 
-    def transfers(self, points: LitPoints, shell: Input | None) -> Node:
+    def transfers(self, points: ShadingContext, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`; where they require a gradient, to the method's native basis.
 
         The product with the matrix between both is NumPy's; :meth:`_free_shading` converts the light instead.
         """
         matrix, visibility_light = self.native_from_basis, self.free_basis_of(points, shell)
-        transfers = PortionedTransfer(self, points, visibility_light, None, caches=matrix is None)
+        transfers = TransferNode(self, points, visibility_light, None, caches=matrix is None)
         if matrix is None or transfers.requires_grad:
             return transfers
 
@@ -267,7 +267,7 @@ class LitPortion(NamedTuple):
     result: Any = None  # of the step after visibility: transfer vectors, or shading
 
 
-class PortionedVisibility(Node):
+class VisibilityNode(Node):
     """Visibility of receivers, found group by group and portion by portion; classes below add steps.
 
     Each step is a function of the method. The value is a list of the results of all portions. Without a gradient,
@@ -288,7 +288,7 @@ class PortionedVisibility(Node):
     def __init__(
         self,
         method: SphereMethod,
-        points: LitPoints,
+        points: ShadingContext,
         projected_light: Node | ProjectedLight,
         light: Input | None,
         *,
@@ -299,22 +299,22 @@ class PortionedVisibility(Node):
         self._progress, weak_points = method.progress and light is not None, points.weak
         suffix, planes = points.suffix if suffix is None else suffix, points.blocker_kinds.planes
         item_text = functools.partial(receiver_text, weak_points)
-        self._visibility = NodeStage(
+        self._visibility = ExplainRow(
             f"visibility{suffix}",
             lambda: method.scene_blockers.pairs_with(weak_points),
             lambda: _why_unblocked(method, weak_points),
         )
-        self._planes = NodeStage(
+        self._planes = ExplainRow(
             f"planes{suffix}",
             lambda: f"{item_text()} × {len(planes)} flat {'body' if len(planes) == 1 else 'bodies'}",
             "" if planes else "spheres stand in for the bodies that cast shadows",
         )
-        self._transfer = NodeStage(
+        self._transfer = ExplainRow(
             f"transfer{suffix}",
             lambda: f"{item_text()} × {method.coefficient_count(light)} coefficients",
             "" if self.needs_transfer else "shading takes transmittance at once",
         )
-        self._shading = NodeStage(f"shading{suffix}", item_text)
+        self._shading = ExplainRow(f"shading{suffix}", item_text)
         steps = self._visibility, self._planes, self._transfer, self._shading
         super().__init__(
             "",
@@ -367,7 +367,7 @@ class PortionedVisibility(Node):
         return portion.result
 
 
-class PortionedTransfer(PortionedVisibility):
+class TransferNode(VisibilityNode):
     """Transfer vectors of receivers."""
 
     step_count = 3
@@ -380,7 +380,7 @@ class PortionedTransfer(PortionedVisibility):
             return portion._replace(result=self.method.transfer(portion.visibility, portion.group, projected_light))
 
 
-class PortionedShading(PortionedTransfer):
+class ShadingNode(TransferNode):
     """Shading of receivers, vec3 of shape [batch, receiver]."""
 
     step_count = 4
@@ -388,7 +388,7 @@ class PortionedShading(PortionedTransfer):
     @property
     def needs_transfer(self) -> bool:
         """Whether the method shades by transfer vectors."""
-        return not self.method.shades_transmittance
+        return not self.method.shades_without_transfer
 
     def compute(self, call: Call) -> Any:
         """Shade all portions."""
@@ -406,32 +406,32 @@ class PortionedShading(PortionedTransfer):
         return portion._replace(result=result)
 
 
-def _find_portions_of(points: LitPoints) -> Callable[..., Iterator[Group]]:
+def _find_portions_of(points: ShadingContext) -> Callable[..., Iterator[Group]]:
     """Make :func:`find_portions` for the receivers of points, without a reference to these."""
     return functools.partial(find_portions, static_bodies=points.static_bodies, nearest_spheres=points.nearest_spheres)
 
 
-def _why_unblocked(method: SphereMethod, points: LitPoints) -> str:
+def _why_unblocked(method: SphereMethod, points: ShadingContext) -> str:
     """Reason why no visibility is computed; empty if it is."""
     if method.why_no_shadows:
         return method.why_no_shadows
     blockers, kinds, static_bodies = method.scene_blockers, points.blocker_kinds, points.static_bodies
     if not blockers.has_any(kinds):
         return f"no body {'but flat ones ' if kinds.planes else ''}has blockers"
-    _, moving, static = points.counts()
+    moving, static, _ = points.counts()
     blocks_static = static_bodies and (method.adds_cached_rows or blockers.has_any(kinds, static_bodies.moving))
     if moving or (static and blocks_static):
         return ""
     return "no moving body has blockers" if static else "nothing is seen"
 
 
-def blockers_node(method: SphereMethod, points: LitPoints) -> Node:
+def blockers_node(method: SphereMethod, points: ShadingContext) -> Node:
     """Node of the blockers around points, where they are in the world."""
     place = functools.partial(method.scene_blockers.place_blockers, points.blocker_kinds)
     return points.cached_of_bodies("blockers", None, lambda: Node("", place, points.vertices, points.spheres))
 
 
-def self_visibility_node(method: SphereMethod, points: LitPoints, projected_light: Node | ProjectedLight) -> Node:
+def self_visibility_node(method: SphereMethod, points: ShadingContext, projected_light: Node | ProjectedLight) -> Node:
     """Node of the receivers' self-visibility lookups, by body; the same for any receivers among the same bodies."""
     make = functools.partial(_self_visibility, method, points.blocker_kinds, projected_light)
     return points.cached_of_bodies("self-visibility", Identity(projected_light), make)
@@ -451,7 +451,7 @@ def _self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds, projecte
     return Node("self-shadows", functools.partial(method.self_lookups, bodies), rotations, projected_light, items=state)
 
 
-def _static_shadows_node(method: SphereMethod, points: LitPoints, light: Input | None) -> Node:
+def _static_shadows_node(method: SphereMethod, points: ShadingContext, light: Input | None) -> Node:
     """Node of cached transmittance past static bodies; its value is None if there are none."""
     static_bodies, weak_points = points.static_bodies, points.weak
     if static_bodies is None or not static_bodies.spheres[1].shape[1]:

@@ -11,7 +11,7 @@ from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.stages.light.shading import shade
 
-Light: TypeAlias = KnownLightArgument | wp.array
+LightArgument: TypeAlias = KnownLightArgument | wp.array
 """A map, SH coefficients [order², 3], or free coefficients in the renderer's basis, vec3 [batch, coefficient]."""
 
 LARGEST_COEFFICIENT = 1e3 * check.LARGEST

@@ -7,8 +7,8 @@ import warp as wp
 
 from warpshadow.device.constants import gather_of_owners
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.pipeline.receivers.lit_points import AdaptiveSurfaces, BlockerKinds
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
+from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.image.slopes import find_mean_slopes
@@ -107,7 +107,11 @@ class ReceiverFinder:
             has_mean_slope=has_mean_slope,
             shares_receivers=None if method.shares_lobes else gather_of_owners(~merged_scene.is_glossy, body_of_face),
         )
-        if receivers.sample_fragments is None or not method.widens_edges or not self._footprint_widths.any():
+        if (
+            receivers.sample_fragments is None
+            or not method.edges_as_wide_as_footprints
+            or not self._footprint_widths.any()
+        ):
             return receivers
         return receivers._replace(footprints=footprints_of(receivers.sample_fragments, receivers.points.shape))
 

@@ -20,8 +20,8 @@ from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.bodies.geometry import PLACED, Geometry, as_geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Clock, Input, Node, identity
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
+from warpshadow.pipeline.receivers.shading_context import BlockerKinds, ShadingContext
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.view import View
@@ -72,7 +72,7 @@ class SceneViews:
         other._set_cameras(cameras)
         return other
 
-    def call(self, points: LitPoints | None = None) -> Call:
+    def call(self, points: ShadingContext | None = None) -> Call:
         """A call, with the cached values of points."""
         return Call(self._clock, points.call if points else None, caches=not self._merged_scene.device.is_capturing)
 
@@ -144,7 +144,7 @@ class SceneViews:
             is_scene_view=geometry is None and clip_matrices is None and image_count == 1,
         )
 
-    def _blocker_kinds(self, geometry: Geometry | None, last: LitPoints | None = None) -> BlockerKinds:
+    def _blocker_kinds(self, geometry: Geometry | None, last: ShadingContext | None = None) -> BlockerKinds:
         """The kind of blocker that each body of a geometry, by default the scene's, is."""
         rotations = self._rotations
         if geometry is not None and geometry.rotations is not None:
@@ -159,7 +159,7 @@ class SceneViews:
             return self.vertices, self._spheres
         return Input("vertices", geometry.positions), Input("spheres", (geometry.centers, geometry.radii))
 
-    def at_points(self, points: wp.array, normals: wp.array, geometry: Geometry | None = None) -> LitPoints:
+    def at_points(self, points: wp.array, normals: wp.array, geometry: Geometry | None = None) -> ShadingContext:
         """Points to be lit by :meth:`shade` that are given, not found in an image.
 
         Nobody knows which body a point is on: all spheres and planes block its light, and where light bounces, none
@@ -174,9 +174,11 @@ class SceneViews:
         receivers = Input("receivers", Receivers(points, normals, None, None, None))  # type: ignore[arg-type]
         node = Node("", identity, receivers)
         bodies, blocker_kinds = self._bodies(geometry), self._method.blocker_kinds(geometry, None)
-        return LitPoints(self._merged_scene, self._materials, *bodies, node, self.call(), blocker_kinds=blocker_kinds)
+        return ShadingContext(
+            self._merged_scene, self._materials, *bodies, node, self.call(), blocker_kinds=blocker_kinds
+        )
 
-    def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray, geometry: Geometry | None = None) -> LitPoints:
+    def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray, geometry: Geometry | None = None) -> ShadingContext:
         """Points on faces of bodies to be lit by :meth:`shade`, by whose own bodies it knows them.
 
         Args:
@@ -193,7 +195,7 @@ class SceneViews:
         normals = Node("", vertex_normals, bodies[0], merged_scene.faces)
         node = Node("", receivers_on_faces, bodies[0], normals, merged_scene.faces, sides, barycentrics, owners)
         points = merged_scene, self._materials, *bodies, node, self.call()
-        return LitPoints(*points, normals=normals, blocker_kinds=blocker_kinds)
+        return ShadingContext(*points, normals=normals, blocker_kinds=blocker_kinds)
 
 
 def camera_batch(cameras: Sequence[Camera]) -> tuple[Camera, ...]:

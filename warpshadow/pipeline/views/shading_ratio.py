@@ -9,7 +9,7 @@ from warpshadow.device.memory import empty
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.methods.by_name import make_method
 from warpshadow.pipeline.node import Call, Input, Node
-from warpshadow.pipeline.receivers.lit_points import LitPoints
+from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.views.view import View
 from warpshadow.stages.receivers.find import Receivers
 
@@ -25,7 +25,7 @@ def shading_ratio(view: View, call: Call) -> np.ndarray:
     without_blockers = make_method(MergedScene(replace(scene, bodies=bodies), device=device), None)
     receivers = Node("", Receivers.without_bodies, view.receivers_node)
     spheres = Input("spheres", tuple(empty((1, 0), dtype=dtype, device=device) for dtype in (wp.vec3, wp.float32)))
-    free = LitPoints(without_blockers.merged_scene, view.materials, view.vertices, spheres, receivers, call)
+    free = ShadingContext(without_blockers.merged_scene, view.materials, view.vertices, spheres, receivers, call)
     methods_and_points = (view.method, view), (without_blockers, free)
     shadings = [method.direct_shading(points, method.light) for method, points in methods_and_points]
     images = (view.white_image(shading).value(call) for shading in shadings)

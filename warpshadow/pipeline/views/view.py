@@ -8,9 +8,9 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.bodies.reflectance import Materials, SampleReflectance
-from warpshadow.pipeline.node import Call, Input, Node, NodeStage, detached, field_of, identity
-from warpshadow.pipeline.receivers.lit_points import BlockerKinds, LitPoints, receiver_text
+from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached, field_of, identity
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
+from warpshadow.pipeline.receivers.shading_context import BlockerKinds, ReceiverCount, ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.transport import LightTransport
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from warpshadow.stages.image.photograph import RatioImage
 
 
-class View(LitPoints):
+class View(ShadingContext):
     """A geometry seen by cameras: all inputs of an image except light and given reflectance.
 
     Args:
@@ -49,7 +49,7 @@ class View(LitPoints):
         call: Holds its values that may not be cached.
         camera: Has the cameras' size and near plane.
         counts: Number of geometries, and of images.
-        is_scene_view: As for :class:`LitPoints`.
+        is_scene_view: As for :class:`ShadingContext`.
     Attributes:
         dependencies: Vertices, spheres, cameras, static bodies, and how all block light.
         clip_positions, fragments_node, silhouettes, receivers_node: Nodes of the visible surfaces.
@@ -144,7 +144,7 @@ class View(LitPoints):
         shading, reflectance = self.shading(light, materials), self._moving_reflectance(materials)
         shines = materials.roughness or materials.emission
         if not shines and reflectance.pyramids.requires_grad and not (shading.requires_grad or clip.requires_grad):
-            replaced_stages = (NodeStage("reflectance", idle="found with the radiance"),)
+            replaced_stages = (ExplainRow("reflectance", idle="found with the radiance"),)
             reflectance_inputs = reflectance.vertex_albedo, reflectance.pyramids, reflectance.footprints
             arguments = fragments, self.merged_scene.faces, *reflectance_inputs, self._white_radiance_of(shading)
             samples = Node(
@@ -347,15 +347,15 @@ class View(LitPoints):
         """Fragment of each sample."""
         return self.fragments_node.value(self.call)
 
-    def counts(self) -> tuple[str, int, int]:
-        """How many receivers may move and how many are static; "up to " where they are not found yet."""
+    def counts(self) -> ReceiverCount:
+        """How many receivers may move and how many are static; at most so many where they are not found yet."""
         if self.receivers_node.value_if_known(self.call) is not None:
             return super().counts()
         at_vertices, static = self._scene_receivers.at_vertices(self.blocker_kinds), 0
         if self.static_bodies is not None:
             static = int((at_vertices & self.static_bodies.has_vertex).sum())
         samples = self._sample_count * self._scene_receivers.at_samples(self.blocker_kinds).any()
-        return "up to ", int(self._pose_count * (at_vertices.sum() - static) + samples), static
+        return ReceiverCount(int(self._pose_count * (at_vertices.sum() - static) + samples), static, is_bound=True)
 
     def _vertices(self) -> str:
         count, static = int(self.merged_scene.first_vertex[-1]), 0

@@ -33,7 +33,7 @@ from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneGrid
 from warpshadow.stages.sparse import SparseMatrix
 
 _CELL_COST = 10.0  # time of a cell of a patch [ns]
-_HIDDEN = wp.constant(0.1)  # β, by which parts count that their own body hides
+_HIDDEN_WEIGHT = wp.constant(0.1)  # β, by which parts count that their own body hides
 
 
 @wp.func
@@ -156,7 +156,7 @@ def _project(
             opposite_transmittance = float(1.0)
             if transmittance:
                 opposite_transmittance = transmittance[transmittance_batch, patch_samples[k], opposite[direction]]
-            projected_area += weights[k] * cosine * (_HIDDEN + (1.0 - _HIDDEN) * opposite_transmittance)
+            projected_area += weights[k] * cosine * (_HIDDEN_WEIGHT + (1.0 - _HIDDEN_WEIGHT) * opposite_transmittance)
         projected_areas[batch, patch, direction] = projected_area
 
 

@@ -20,11 +20,11 @@ import warp as wp
 
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 
-_CORE = 0.25  # radii within which a proxy's weight hardly grows any more
+_CORE_RADIUS = 0.25  # radii within which a proxy's weight hardly grows any more
 
 _NEAREST2 = 1.0e-12  # the least d² + (r/4)², in squares of s: so √w is at most 1e12
 
-_HIDDEN = 1.0e-8  # ε
+_HIDDEN_FACING = 1.0e-8  # ε, of receivers below the tangent plane
 _TINY = 1.0e-18  # distance that has a derivative
 
 
@@ -51,8 +51,8 @@ def make_weight_functions(lanes: int) -> WeightFunctions:
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     fn = make_lane_functions(lanes)
     sqrt, dot, dot_direction, total, scale, add = fn.sqrt, fn.dot, fn.dot_direction, fn.total, fn.scale, fn.add
-    CORE, CORE2, NEAREST2 = wp.constant(_CORE), wp.constant(_CORE**2), wp.constant(_NEAREST2)
-    TINY, HIDDEN = wp.constant(_TINY), wp.constant(_HIDDEN)
+    CORE, CORE2, NEAREST2 = wp.constant(_CORE_RADIUS), wp.constant(_CORE_RADIUS**2), wp.constant(_NEAREST2)
+    TINY, HIDDEN = wp.constant(_TINY), wp.constant(_HIDDEN_FACING)
 
     @wp.func(inline=True)
     def find_nearness(offset: Vectors, curvature: float, inverse_size: float):

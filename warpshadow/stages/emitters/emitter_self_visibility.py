@@ -34,8 +34,8 @@ _NEGLIGIBLE = 1.0e-7
 _LIFT = 1.0e-4  # height above the surface at which rays start [sizes of the body]
 _MIN_HIDDEN = 1.0e-3  # mean hidden share of a body below which it has no table: rounding at edges of convex bodies
 
-_EDGE = 0.1  # half-width of the fall of S [D_q]
-_OWN_REACH = 1.25  # middle of that fall for receivers on the lamp itself, which are at D_q
+_FALL_HALF_WIDTH = 0.1  # half-width of the fall of S [D_q]
+_REACH_ON_LAMP = 1.25  # middle of that fall for receivers on the lamp itself, which are at D_q
 _REACH_COSINE = float(np.cos(KERNEL_RADIUS * cell_radius(len(CELLS))))
 
 wp.set_module_options({"max_unroll": 1})
@@ -200,7 +200,9 @@ def _look_up(
             weight = kernel_weight * kernel_weight + _NEGLIGIBLE
             share = far_transmittance[i, cell]
             middle = reach * distances[i, cell]
-            nearness = 1.0 - wp.smoothstep((1.0 - _EDGE) * middle, (1.0 + _EDGE) * middle, distance)
+            nearness = 1.0 - wp.smoothstep(
+                (1.0 - _FALL_HALF_WIDTH) * middle, (1.0 + _FALL_HALF_WIDTH) * middle, distance
+            )
             weighted_sum += weight * wp.vec2(share + (1.0 - share) * nearness, 1.0)
         weighted_sums[batch, receiver, i] = weighted_sum
 
@@ -254,7 +256,7 @@ def look_up_self_visibility(
         count * points.shape[1],
         inputs=[
             *(points, sample_points, span.first, moments, nearest_rotations(moments), *table, *cells),
-            *(_REACH_COSINE, _OWN_REACH if is_own else 1.0),
+            *(_REACH_COSINE, _REACH_ON_LAMP if is_own else 1.0),
         ],
         outputs=[weighted_sums],
         shared=[points, sample_points, moments],

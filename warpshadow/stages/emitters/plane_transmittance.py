@@ -27,7 +27,7 @@ from warpshadow.stages.emitters.sphere_transmittance import log_transmittance
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneGrid
 
 _COST = 5.0  # nanoseconds that a plane takes for a sample
-_SUNK = 8.0  # r counts whole from a sixteenth of the lamp on that is beyond the plane
+_SINKING_SLOPE = 8.0  # r counts whole from a sixteenth of the lamp on that is beyond the plane
 _MIN_WIDTH = 1.0e-6  # least half-width of an edge, in distances of the sample
 
 wp.set_module_options({"max_unroll": 1})
@@ -87,7 +87,7 @@ def _covered_share(
     margin = grid.margin * scale
     disc_radius = sample_radius(area)
     cosine = wp.dot(normal, area) / wp.max(wp.length(area), 1.0e-30)
-    sunk = wp.min(_SUNK * (1.0 - wp.abs(side)), 1.0)
+    sunk = wp.min(_SINKING_SLOPE * (1.0 - wp.abs(side)), 1.0)
     reach = wp.max(sunk * disc_radius * wp.sqrt(wp.max(1.0 - cosine * cosine, 1.0e-6)), margin)
     end_height = wp.where(height < 0.0, -height - rise, height + rise)
     share_beyond = 1.0 - wp.smoothstep(-1.0, 1.0, (end_height + 2.0 * margin) / reach)

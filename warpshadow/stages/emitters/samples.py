@@ -173,11 +173,11 @@ def _find_surface_points(
 
 
 EVERYWHERE = (3.0, 4.0)
-"""The beam (:mod:`.beams`) of an emitter that has none."""
+"""The beam (:mod:`.spot_cones`) of an emitter that has none."""
 
 
 class EmitterBeams(NamedTuple):
-    """Beams of emitters (:mod:`.beams`); some emitters may have none."""
+    """Beams of emitters (:mod:`.spot_cones`); some emitters may have none."""
 
     beams: np.ndarray  # of the emitters, EVERYWHERE for none, shape [emitter, 2]
     vertices: SparseMatrix  # weights of all vertices in the emitters' axes, [emitter, vertex]

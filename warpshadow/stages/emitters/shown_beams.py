@@ -8,8 +8,8 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.parallel import find_run, run_dimensions, run_length
-from warpshadow.stages.emitters.beams import beam_share
 from warpshadow.stages.emitters.samples import PlacedSamples
+from warpshadow.stages.emitters.spot_cones import beam_share
 from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.raster.project import eye_position
 from warpshadow.stages.raster.rasterization import Fragments

@@ -17,8 +17,8 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.adjacency import area_normals
-from warpshadow.stages.emitters.beams import beam_share
 from warpshadow.stages.emitters.samples import SURFACE_POINTS, EmitterSamples, EmitterSpan, may_light
+from warpshadow.stages.emitters.spot_cones import beam_share
 from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.rays.ray_tracing import RAY_COST, mesh_id, progress_slices, sees_point
 from warpshadow.stages.textures.pyramid import Textures

@@ -10,7 +10,7 @@ from warpshadow import check
 from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import locked
 
 _SHARED_POINTS_RATIO = 0.02  # points that two neighboring nodes carry together, as a fraction of a node's points
 
@@ -146,7 +146,7 @@ class DeformationGraph:
             wp.array(weights.astype(np.float32), device=device),
         )
 
-    @one_at_a_time
+    @locked
     def points(self, matrices: wp.array, translations: wp.array) -> wp.array:
         """Deform the bound points.
 
@@ -163,7 +163,7 @@ class DeformationGraph:
         launch(_deform_points, deformed.shape, inputs=inputs, outputs=[deformed])
         return deformed
 
-    @one_at_a_time
+    @locked
     def centers(self, translations: wp.array) -> wp.array:
         """Displaced positions of the nodes: vec3 of shape [batch, node]. Differentiable: translations."""
         check.shape("translations", translations.shape, ("batch", self.node_positions.shape[0]))
@@ -172,7 +172,7 @@ class DeformationGraph:
         launch(_move_nodes, moved_centers.shape, inputs=[self.node_positions, translations], outputs=[moved_centers])
         return moved_centers
 
-    @one_at_a_time
+    @locked
     def rigidity(self, matrices: wp.array, translations: wp.array) -> wp.array:
         """As-rigid-as-possible energy Σ |M_j (g_k − g_j) + g_j + t_j − (g_k + t_k)|² over neighbors (E_reg of Sumner).
 
@@ -184,7 +184,7 @@ class DeformationGraph:
         inputs = [self.node_positions, self.neighbors, matrices, translations]
         return _sum_energy("matrices, translations", _sum_rigidity, (len(matrices), len(self.neighbors)), inputs)
 
-    @one_at_a_time
+    @locked
     def shear(self, matrices: wp.array) -> wp.array:
         """Distance of the matrices from rotations, Σ |MᵀM − I|² (as E_rot of Sumner): float32 of shape [batch].
 

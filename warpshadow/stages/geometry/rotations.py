@@ -7,7 +7,7 @@ from warpshadow import check
 from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import locked
 from warpshadow.stages.geometry.nearest_rotation import nearest_rotations
 
 Vec6 = wp.types.vector(length=6, dtype=wp.float32)
@@ -79,7 +79,7 @@ def _rotate_by_columns(
 _ROTATION_KERNELS = {wp.vec4: _rotate_by_quaternions, wp.vec3: _rotate_by_axis_angles, Vec6: _rotate_by_columns}
 
 
-@one_at_a_time
+@locked
 def rotation_matrices(parameters: wp.array) -> wp.array:
     """Make rotation matrices of free parameters, such as axis-angle vectors in radians.
 

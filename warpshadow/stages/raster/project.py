@@ -8,7 +8,7 @@ from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.device.threads import one_at_a_time
+from warpshadow.device.threads import locked
 
 
 @wp.func
@@ -54,7 +54,7 @@ def _compose_clip_matrices(
     )  # fmt: skip
 
 
-@one_at_a_time
+@locked
 def compose_clip_matrices(
     intrinsics: wp.array, rotations: wp.array, translations: wp.array, *, size: tuple[int, int], near: float = 0.01
 ) -> wp.array:

@@ -33,7 +33,7 @@ from warpshadow.stages.emitters.traced_transmittance import EmittingFaces, light
 from warpshadow.stages.light.light_samples import LightSamples
 from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.rays.ray_tracing import RAY_COST, escapes, first_hit, mesh_id, progress_slices
-from warpshadow.stages.shell.beams import FAR, beam_to_shell
+from warpshadow.stages.shell.shell_rays import FAR, beam_to_shell
 from warpshadow.stages.textures.pyramid import Textures
 from warpshadow.stages.textures.sample import interpolate_uv
 

@@ -29,7 +29,7 @@ from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, make_find_open,
 from warpshadow.stages.rays.ray_tracing import progress_slices
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.receivers.sample_receivers import MAX_SHARED_SLOPE, MIN_SHARED_COSINE
-from warpshadow.stages.shell.beams import FAR
+from warpshadow.stages.shell.shell_rays import FAR
 
 _PACKET_COST = 2000.0  # nanoseconds that a packet takes
 _PILOT_RECEIVERS = 256  # receivers that stand for all, where directions are chosen

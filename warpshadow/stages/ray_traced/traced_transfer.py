@@ -13,7 +13,7 @@ from warpshadow.maths.directions import CHUNK, fibonacci
 from warpshadow.stages.rays.beam_packets import make_beams
 from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open, packets_of
 from warpshadow.stages.rays.ray_tracing import progress_slices
-from warpshadow.stages.shell.beams import FAR
+from warpshadow.stages.shell.shell_rays import FAR
 
 _RAY_COST = 60.0  # nanoseconds that a ray takes
 

@@ -1,4 +1,4 @@
-"""Beams to the shell for packets of rays, as :mod:`warpshadow.stages.shell.beams` has them for one."""
+"""Beams to the shell for packets of rays, as :mod:`warpshadow.stages.shell.shell_rays` has them for one."""
 
 import functools
 
@@ -6,7 +6,7 @@ import warp as wp
 
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.stages.rays.ray_packets import PACKET
-from warpshadow.stages.shell.beams import MIN_DISTANCE, center_of
+from warpshadow.stages.shell.shell_rays import MIN_DISTANCE, center_of
 
 _MIN_DISTANCE2 = MIN_DISTANCE**2
 
@@ -17,7 +17,7 @@ def make_beams(is_near: bool) -> tuple[wp.Function, wp.Function]:
 
     Given the shell, the receiver and the directions of the light, the first finds the rays, of any length; the second,
     given the normal in place of the point, and the rays, their cosines, times the factor of
-    :mod:`warpshadow.stages.shell.beams`.
+    :mod:`warpshadow.stages.shell.shell_rays`.
     """
     Lane, Vectors, fn = lane_type(PACKET), vectors_type(PACKET), make_lane_functions(PACKET)
     add, dot, dot_direction, scale = fn.add, fn.dot, fn.dot_direction, fn.scale

@@ -11,7 +11,7 @@ from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import split_row
 from warpshadow.device.progress import progress_bar
 from warpshadow.stages.light.light_samples import CellSamples, LightSamples
-from warpshadow.stages.shell.beams import FAR, beam_to_shell
+from warpshadow.stages.shell.shell_rays import FAR, beam_to_shell
 
 RAY_COST = 200.0  # nanoseconds that a ray takes
 

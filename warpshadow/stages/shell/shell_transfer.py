@@ -25,7 +25,7 @@ from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import cell_radius, check_count
 from warpshadow.stages.cell_neighbors import cell_neighbors, texel_of
-from warpshadow.stages.shell.beams import center_of
+from warpshadow.stages.shell.shell_rays import center_of
 
 SHELL_KERNEL_RADIUS = 1.6
 """Distance of a cell from which it no longer counts, in cell radii: 3 to 6 cells count. The least that reaches one cell

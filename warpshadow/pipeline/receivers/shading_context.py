@@ -1,4 +1,4 @@
-"""Points that are lit: their surroundings, and the values that are cached for them."""
+"""Context of shading: points that are lit, their surroundings, and the values that are cached for them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from warpshadow.pipeline.receivers.static import StaticBodies
 
 Cached = TypeVar("Cached")
-Points = TypeVar("Points", bound="LitPoints")
+Context = TypeVar("Context", bound="ShadingContext")
 
 
 class BlockerKinds(NamedTuple):
@@ -54,11 +54,21 @@ class AdaptiveSurfaces(NamedTuple):
     footprints_of: Callable[[Fragments, tuple[int, int]], wp.array]
 
 
+class ReceiverCount(NamedTuple):
+    """Number of receivers."""
+
+    moving: int  # those on bodies that may move
+    static: int
+    is_bound: bool = False  # whether there may be fewer that move
+
+
 ONLY_SPHERES = BlockerKinds()  # all bodies block by their spheres
 
 
-class LitPoints:
-    """Points that are lit, such as the receivers of a view: all that their light depends on but light and method.
+class ShadingContext:
+    """Receivers, such as those of a view, and all that their shading depends on but the light and the method.
+
+    Bodies in their poses, materials, and values that are cached. PBRT calls such records contexts.
 
     Args:
         merged_scene: The bodies among which they are.
@@ -90,7 +100,7 @@ class LitPoints:
         blocker_kinds: BlockerKinds = ONLY_SPHERES,
         is_scene_view: bool = False,
         nearest_spheres: np.ndarray | None = None,
-        neighbors: LitPoints | None = None,
+        neighbors: ShadingContext | None = None,
         suffix: str = "",
     ):
         self.suffix = suffix
@@ -116,25 +126,25 @@ class LitPoints:
         """A cached value that all points among the same bodies share."""
         return _cached(self._cached_of_bodies, name, key, make)
 
-    def with_receivers(self: Points, receivers: Node) -> Points:
+    def with_receivers(self: Context, receivers: Node) -> Context:
         """Copy with other receivers, without cached values; any of the blockers may move."""
         points = copy.copy(self)
         points.receivers_node, points.static_bodies, points.is_scene_view = receivers, None, False
         points._cached = {}
         return points
 
-    def preview(self: Points) -> Points:
+    def preview(self: Context) -> Context:
         """The points with the values cached so far, which does not add its own to them."""
         points = copy.copy(self)
         points._cached_of_bodies = dict(self._cached_of_bodies)
         points._cached = {
-            name: (key, value.preview() if isinstance(value, LitPoints) else value)
+            name: (key, value.preview() if isinstance(value, ShadingContext) else value)
             for name, (key, value) in self._cached.items()
         }
         return points
 
     @property
-    def weak(self: Points) -> Points:
+    def weak(self: Context) -> Context:
         """A weak reference to the points, for functions that put a node of theirs into words.
 
         These must not hold the points, which hold the node: arrays would stay until Python collects garbage.
@@ -146,10 +156,10 @@ class LitPoints:
         """Where light is evaluated."""
         return self.receivers_node.value(self.call)
 
-    def counts(self) -> tuple[str, int, int]:
-        """How many receivers may move and how many are static; "up to " where they are not found yet."""
+    def counts(self) -> ReceiverCount:
+        """How many receivers may move and how many are static; at most so many where they are not found yet."""
         receivers = self.receivers
-        return "", receivers.points.size, len(receivers.static_vertices)
+        return ReceiverCount(receivers.points.size, len(receivers.static_vertices))
 
 
 def _cached(values: dict[str, tuple[Hashable, Any]], name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
@@ -158,7 +168,7 @@ def _cached(values: dict[str, tuple[Hashable, Any]], name: str, key: Hashable, m
     return values[name][1]  # type: ignore[no-any-return]
 
 
-def receiver_text(points: LitPoints, *, moving: bool = True, static: bool = True) -> str:
+def receiver_text(points: ShadingContext, *, moving: bool = True, static: bool = True) -> str:
     """Number of receivers, in words."""
-    up_to, moving_count, static_count = points.counts()
-    return f"{up_to}{moving * moving_count + static * static_count:,} receivers"
+    count = points.counts()
+    return f"{'up to ' * count.is_bound}{moving * count.moving + static * count.static:,} receivers"

@@ -9,8 +9,8 @@ from warpshadow.device.tape import recorded
 from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.light.transfer import sh_product
-from warpshadow.stages.self_visibility.lobes import find_body_rotation, project_rows, self_visibility_lobes
 from warpshadow.stages.self_visibility.probes import ProbeWeights
+from warpshadow.stages.self_visibility.self_transfer import find_body_rotation, project_rows, self_visibility_lobes
 from warpshadow.stages.self_visibility.trace import VisibilityRows
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")

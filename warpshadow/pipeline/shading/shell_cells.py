@@ -1,6 +1,6 @@
-"""Light from a shell: an environment at a finite distance, as the patches of a sphere around the scene.
+"""Light from a shell: an environment at a finite distance, as the cells of a sphere around the scene.
 
-The light of a shell is known or free radiance of its patches, :data:`PATCHES`: a basis of cells, of directions from its
+The light of a shell is known or free radiance of its cells, :data:`SHELL_BASIS`, directions from its
 center. Transfer vectors are to these (:mod:`.stages.shell.shell_transfer`), and depend on where the receivers are; all
 that is linear in light stays so. Visibility does not depend on the shell, so it is that of any light in cells.
 """
@@ -14,24 +14,24 @@ from warpshadow.assets.basis import CellBasis
 from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.constants import constant
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.shell.beams import check_within
+from warpshadow.stages.shell.shell_rays import check_within
 from warpshadow.stages.shell.shell_transfer import shell_transfer
 
-PATCHES = CellBasis(fibonacci(512))
-"""Patches of a shell. Under even light, receivers at up to 0.9 radii from its center are 1% off on average; with 1024
+SHELL_BASIS = CellBasis(fibonacci(512))
+"""Cells of a shell. Under even light, receivers at up to 0.9 radii from its center are 1% off on average; with 1024
 0.4%, in twice the time."""
 
 
-class ShellPatches(NamedTuple):
-    """The patches of a shell."""
+class ShellCells(NamedTuple):
+    """The cells of a shell."""
 
     shell: wp.array  # center and radius, vec4 of shape [batch]
-    directions: np.ndarray = PATCHES.directions  # from the center to their light [patch, 3]
+    directions: np.ndarray = SHELL_BASIS.directions  # from the center to their light [cell, 3]
 
     def transfer(
         self, points: wp.array, normals: wp.array, transmittance: wp.array | None, cell_directions: np.ndarray
     ) -> wp.array:
-        """Transfer vectors of receivers, float32 of shape [batch, receiver, patch], given transmittance in cells.
+        """Transfer vectors of receivers, float32 of shape [batch, receiver, shell cell], given transmittance in cells.
 
         Raises:
             ValueError: where receivers are outside.
@@ -41,7 +41,7 @@ class ShellPatches(NamedTuple):
         return shell_transfer(points, normals, transmittance, cell_directions, self.shell, self.directions)
 
 
-def project_on_shell(light: KnownLight, shell: wp.array) -> tuple[ShellPatches, wp.array]:
-    """Project known light on the patches of a shell: the patches, and their radiance, vec3 of shape [1, patch]."""
-    cell_light = light.cells(PATCHES.directions)
-    return ShellPatches(shell, cell_light.directions), constant(cell_light.radiance[None], wp.vec3, shell.device)
+def project_on_shell(light: KnownLight, shell: wp.array) -> tuple[ShellCells, wp.array]:
+    """Project known light on the cells of a shell: the cells, and their radiance, vec3 of shape [1, shell cell]."""
+    cell_light = light.cells(SHELL_BASIS.directions)
+    return ShellCells(shell, cell_light.directions), constant(cell_light.radiance[None], wp.vec3, shell.device)

@@ -7,9 +7,9 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.assets.camera import Camera
-from warpshadow.stages.emitters.beams import beam_of, find_axis_weights, weigh_by_beam
 from warpshadow.stages.emitters.samples import EVERYWHERE, EmitterSpan, PlacedSamples
 from warpshadow.stages.emitters.shown_beams import show_beams
+from warpshadow.stages.emitters.spot_cones import beam_of, find_axis_weights, weigh_by_beam
 from warpshadow.stages.raster.rasterization import Fragments
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
