@@ -777,9 +777,10 @@ def test_gradients_of_the_light_of_metals_are_exact(quantity, double, device, ch
     """Of samples that meet a face whose mirrored ray is open, or blocked, or no face."""
     module = double("stages.gloss.mirrored")
     hits = np.int32([[[0, 0, -1], [1, -1, 1]]]), np.abs(random(0, 1, 2, 3, 3)), unit(random(1, 1, 2, 3, 3))
-    dtypes, is_open = (wp.int32, wp.vec3d, wp.vec3d, wp.float64), np.float64([[[1, 0, 0], [1, 0, 0]]])
+    dtypes = wp.int32, wp.vec3d, wp.vec3d, wp.float64, wp.vec3d
+    is_open, points = np.float64([[[1, 0, 0], [1, 0, 0]]]), np.zeros((1, 2, 3, 3))
     hits = double("stages.gloss.lobe_hits").LobeHits(
-        *(put(values, dtype, device) for values, dtype in zip((*hits, is_open), dtypes, strict=True))
+        *(put(values, dtype, device) for values, dtype in zip((*hits, is_open, points), dtypes, strict=True))
     )
     faces = put(np.int32([[0, 1, 2], [1, 3, 2]]), wp.vec3i, device)
 

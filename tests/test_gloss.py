@@ -333,6 +333,22 @@ def test_a_metal_that_a_metal_mirrors_shows_the_sky_that_it_mirrors():
     np.testing.assert_allclose(image.mean(axis=(0, 1)), 2.0 * color**2, rtol=0.05)
 
 
+def test_near_light_that_a_metal_mirrors_for_another_comes_from_where_the_first_stands():
+    """A stripe of light is beside where a ray from the wall meets the shell, and where one from the ground would."""
+    options = {"albedo": (1.0, 1.0, 1.0), "roughness": 0.1, "metallic": 1.0}
+    ground = ws.Body(ws.plane(3.0), **options)
+    wall = ws.Body(ws.plane(3.0), rotation=(0, 0, 90), translation=(1.5, 1.5, 0), **options)
+    camera = ws.Camera.look_at((-5, 2.5, 0), (0, 0, 0), fov_y=2, size=(4, 4))
+    direction, hit, radius = np.array([-2, 1, 0]) / np.sqrt(5), np.array([1.5, 0.75, 0]), 4.0
+    along = hit @ direction
+    exits = hit + (np.sqrt(along**2 - hit @ hit + radius**2) - along) * direction
+    is_bright = sh.equirectangular_directions(64) @ exits / radius > np.cos(np.radians(8))
+    radiance = np.where(is_bright[..., None], 2.0, 0.0).astype(np.float32).repeat(3, axis=2)
+    light = ws.EnvironmentMap(radiance, radius=radius)
+    image = ws.render(ws.Scene([ground, wall], light, camera, bounces=2))[..., :3]
+    np.testing.assert_allclose(image.mean(axis=(0, 1)), 2.0, rtol=0.05)
+
+
 TILES = dataclasses.replace(GROUND, roughness=0.4, metallic=0.6)
 """A ground with uvs that shines."""
 

@@ -42,9 +42,13 @@ def test_a_sun_below_a_ground_is_remarked_on(height, is_below):
     assert bool(remarks) == is_below
     assert not is_below or "(0.72, -0.6, 0.36), below body 1 ('ground')" in remarks[0]
     assert not sun_below(ws.Scene([gold()], light))  # nothing keeps its light from the body
+    assert not sun_below(ws.Scene([GROUND], light))  # nor is there a body that it could be kept from
 
 
-@pytest.mark.parametrize("light", [SKY, ws.synthetic_sky(), ws.EnvironmentMap.constant(0.0)])
+TWO_SUNS = SKY.with_sun((0.4, 0.9, -0.3), irradiance=3.0).with_sun((0.1, -0.8, 0.6), irradiance=3.1)
+
+
+@pytest.mark.parametrize("light", [SKY, ws.synthetic_sky(), ws.EnvironmentMap.constant(0.0), TWO_SUNS])
 def test_light_without_a_low_sun_draws_no_remark(light):
     assert not sun_below(ws.Scene([gold(), GROUND], light))
 

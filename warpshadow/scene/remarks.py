@@ -19,6 +19,7 @@ _HALF = 0.5  # share of all light that is looked for in the brightest part of a 
 _GROUND_COSINE = 0.99  # cosine of the angle to +y up to which a flat body is a ground
 _CEILING_RATIO = 1.01  # ratio of breadths up to which a body is as broad as its ground, such as a ceiling
 _SUN_SHARE = 0.01  # of all directions, from which half of the light comes where there is a sun
+_ONE_SUN = 0.99  # length of the mean direction of that light from which on it is one sun: two are apart
 _LOW_SUN = -0.02  # height of the direction to a sun from which on it is below the horizon, by more than its rim
 _METAL = 0.5  # share of metal from which a body is one
 
@@ -183,7 +184,12 @@ def blurred_shell(scene: Scene) -> list[str]:
 def sun_below(scene: Scene) -> list[str]:
     """Remark on a map whose sun is below the horizon, where a body that casts shadows is a ground, broader than all."""
     light = scene.known_light
-    if not isinstance(light, EnvironmentMap) or light.shell is not None or not grounds_of(scene):
+    if (
+        not isinstance(light, EnvironmentMap)
+        or light.shell is not None
+        or len(scene.bodies) < 2
+        or not grounds_of(scene)
+    ):
         return []
     solid_angles = np.repeat(light.solid_angles(), light.radiance.shape[1])
     luminance = light.radiance.mean(axis=2, dtype=np.float64).ravel()
@@ -192,11 +198,11 @@ def sun_below(scene: Scene) -> list[str]:
     sun = brightest[: np.searchsorted(powers.cumsum(), powers.sum() / 2) + 1]
     if not powers.sum() or solid_angles[sun].sum() > _SUN_SHARE * 4 * np.pi:
         return []
-    direction = powers[: len(sun)] @ light.directions().reshape(-1, 3)[sun]
-    direction /= max(np.linalg.norm(direction), 1e-12)
-    if direction[1] > _LOW_SUN:
+    direction = powers[: len(sun)] @ light.directions().reshape(-1, 3)[sun] / powers[: len(sun)].sum()
+    length = np.linalg.norm(direction)
+    if length < _ONE_SUN or direction[1] > _LOW_SUN:
         return []
-    x, y, z = direction.tolist()
+    x, y, z = (direction / length).tolist()
     number = grounds_of(scene)[0]
     return [
         f"light: its sun is at ({x:.2g}, {y:.2g}, {z:.2g}), below body {number} ({scene.bodies[number].name!r}), which "

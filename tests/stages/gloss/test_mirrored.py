@@ -46,16 +46,18 @@ def expected_hits():
     towards = DIRECTIONS - 2 * (DIRECTIONS * normals).sum(axis=-1, keepdims=True) * normals
     at_wall = y + ((-2 - y[..., :1]) / np.minimum(towards[..., :1], -1e-6)) * towards
     is_open = (np.abs(at_wall[..., 1:]) > 1.6).any(axis=-1)
-    return meets, normals, is_open, towards
+    return meets, normals, is_open, towards, y
 
 
 def test_samples_meet_the_mirror_alone_and_see_what_its_normals_mirror(device):
     hits, _ = hits_of(device)
-    meets, normals, is_open, _ = expected_hits()
+    meets, normals, is_open, _, places = expected_hits()
     np.testing.assert_array_equal(hits.face_ids.numpy() >= 0, meets)
     assert meets.sum() == 3 and set(is_open[meets]) == {True, False}
     np.testing.assert_allclose(hits.normals.numpy()[meets], normals[meets], atol=FLOAT32)
     np.testing.assert_array_equal(hits.is_open.numpy()[meets], is_open[meets])
+    expected = np.where(meets[..., None], places, POINTS[:, None])
+    np.testing.assert_allclose(hits.points.numpy(), expected, atol=FLOAT32)
 
 
 def test_nothing_is_traced_towards_open_sky(device):
@@ -91,7 +93,7 @@ def test_metals_send_the_light_that_they_mirror_in_their_color(device):
     hits, faces = hits_of(device)
     arrays = inputs_of(device)
     radiance, towards = mixed(device, batched(hits), faces, *arrays)
-    meets, normals, is_open, expected_towards = expected_hits()
+    meets, normals, is_open, expected_towards, _ = expected_hits()
     roughness, _, filters, albedo, metallic, mean = (array.numpy()[0] for array in arrays)
     weights, corners = hits.barycentrics.numpy()[meets], FACES[hits.face_ids.numpy()[meets]]
     rough, color, share = (

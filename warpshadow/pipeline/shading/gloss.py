@@ -71,7 +71,8 @@ def mix_gloss(
     samples = points.cached("lobes", materials.roughness, sample)
     directions, filters = field_of(samples, "directions"), field_of(samples, "filters")
     texels = _prefiltered(method, points, light)
-    radiance = _look_up(method, points, "prefiltered light", light, texels, directions, filters)
+    starts = field_of(points.receivers_node, "points")
+    radiance = _look_up(method, points, "prefiltered light", light, texels, directions, filters, starts)
     transmittance = visibility.transmittance(lobes, directions)
     if blocked is not None and visibility.traces_hits and materials.may_be_metal:
         from warpshadow.pipeline.shading.mirrored_bodies import find_mirrored_radiance
@@ -95,14 +96,20 @@ def mix_gloss(
 
 
 def _look_up(
-    method: Method, points: GlossyPoints, name: str, light: LightInput, texels: Node, directions: Node, filters: Node
+    method: Method,
+    points: GlossyPoints,
+    name: str,
+    light: LightInput,
+    texels: Node,
+    directions: Node,
+    filters: Node,
+    starts: Node,
 ) -> Node:
-    """Node of light without shadows from directions, vec3 of shape [batch, receiver, sample]."""
+    """Node of light without shadows along rays from ``starts``, vec3 of shape [batch, receiver, sample]."""
     shell = method.shell_of(light)
     if shell is not None:
-        directions = Node("", exits_from_shell, field_of(points.receivers_node, "points"), directions, shell)
-    items = functools.partial(receiver_text, points.weak)
-    return Node(name, look_up_light, texels, directions, filters, items=items)
+        directions = Node("", exits_from_shell, starts, directions, shell)
+    return Node(name, look_up_light, texels, directions, filters, items=functools.partial(receiver_text, points.weak))
 
 
 def _find_values(points: GlossyPoints, materials: Materials, name: str) -> Node:

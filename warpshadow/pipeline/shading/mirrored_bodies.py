@@ -13,7 +13,7 @@ from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node, detached, field_of
 from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
-from warpshadow.stages.gloss.lobe_hits import LobeHits, trace_hits
+from warpshadow.stages.gloss.lobe_hits import HIT_TYPES, LobeHits, trace_hits
 from warpshadow.stages.gloss.mirrored import mirror, mix_mirrored
 from warpshadow.stages.receivers.find import Receivers
 
@@ -24,7 +24,7 @@ def find_mirrored_radiance(
     samples: Node,
     transmittance: Node,
     mean_radiance: Node,
-    look_up: Callable[[Node, Node], Node],
+    look_up: Callable[[Node, Node, Node], Node],
 ) -> Node:
     """Node of the radiance of blockers, vec3 of shape [batch, receiver, sample].
 
@@ -34,7 +34,7 @@ def find_mirrored_radiance(
         samples: Node of their lobes' samples.
         transmittance: Node of the samples' transmittance, 0 or 1.
         mean_radiance: Node of the mean radiance of each receiver's blockers.
-        look_up: Makes the node of light without shadows, of nodes of directions and filters.
+        look_up: Makes the node of light without shadows, of nodes of directions, filters, and where these rays start.
     """
     merged_scene, faces = points.merged_scene, points.merged_scene.faces
     directions = field_of(samples, "directions")
@@ -45,7 +45,7 @@ def find_mirrored_radiance(
     roughness, albedo, metallic = (materials.of_vertices(name) for name in ("roughness", "albedo", "metallic"))
     mirrored = Node("", mirror, hits, faces, roughness, directions, field_of(samples, "filters"))
     filters = field_of(mirrored, "filters")
-    light = look_up(field_of(mirrored, "directions"), filters)
+    light = look_up(field_of(mirrored, "directions"), filters, field_of(hits, "points"))
     return Node("light of metals", mix_mirrored, hits, faces, albedo, metallic, filters, light, mean_radiance)
 
 
@@ -80,8 +80,7 @@ def _find_hits(
         )
         for instance in range(len(directions) if directions.size else 0)
     ]
-    dtypes = wp.int32, wp.vec3, wp.vec3, wp.float32
-    joined = [wp.empty(directions.shape, dtype=dtype, device=directions.device) for dtype in dtypes]
+    joined = [wp.empty(directions.shape, dtype=dtype, device=directions.device) for dtype in HIT_TYPES]
     for array, parts in zip(joined, zip(*hits, strict=True), strict=False):
         for instance, part in enumerate(parts):
             wp.copy(array[instance], part)

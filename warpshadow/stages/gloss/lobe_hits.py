@@ -30,12 +30,14 @@ def _trace_hits(
     barycentrics: wp.array2d(dtype=wp.vec3),
     hit_normals: wp.array2d(dtype=wp.vec3),
     is_open: wp.array2d(dtype=wp.float32),
+    hit_points: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a sample."""
     row, sample = wp.tid()
     receiver = first_row + row
     direction = directions[receiver, sample]
     face = int(-1)
+    point = points[receiver]
     if transmittance[receiver, sample] < 1.0 and wp.dot(direction, normals[receiver]) > 0.0:
         hit = first_hit(mesh, points[receiver], normals[receiver], direction)
         face = hit.face
@@ -59,6 +61,7 @@ def _trace_hits(
             if cosine < 0.0 and escapes(mesh, point, normal, mirrored):
                 is_open[receiver, sample] = 1.0
     face_ids[receiver, sample] = face
+    hit_points[receiver, sample] = point
 
 
 class LobeHits(NamedTuple):
@@ -68,6 +71,10 @@ class LobeHits(NamedTuple):
     barycentrics: wp.array  # vec3
     normals: wp.array  # unit normals on the side that is met, vec3
     is_open: wp.array  # T', float32
+    points: wp.array  # vec3 [scene units]; the receiver of a sample that meets no such body
+
+
+HIT_TYPES = wp.int32, wp.vec3, wp.vec3, wp.float32, wp.vec3  # of the arrays of LobeHits
 
 
 def trace_hits(
@@ -94,7 +101,7 @@ def trace_hits(
     Differentiable: no.
     """
     shape, device = directions.shape, points.device
-    hits = LobeHits(*(empty(shape, dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3, wp.vec3, wp.float32)))
+    hits = LobeHits(*(empty(shape, dtype=dtype, device=device) for dtype in HIT_TYPES))
     inputs = [mesh.id, is_mirror, faces, vertex_normals, points, normals, directions, transmittance]
     launch(_trace_hits, shape, inputs=inputs, outputs=[*hits], cost=2 * RAY_COST * shape[1])
     return hits

@@ -17,7 +17,7 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty
+from warpshadow.device.memory import empty, reshaped
 
 MIN_DISTANCE = 1.0e-6  # between a receiver and the shell, in radii, nearer than which light no longer grows
 
@@ -49,7 +49,7 @@ def beam_to_shell(shell: wp.vec4, point: wp.vec3, direction: wp.vec3):
 @wp.kernel
 def _find_exits(
     # in
-    points: wp.array2d(dtype=wp.vec3),
+    points: wp.array3d(dtype=wp.vec3),
     directions: wp.array3d(dtype=wp.vec3),
     shell: wp.array(dtype=wp.vec4),
     # out
@@ -58,7 +58,8 @@ def _find_exits(
     """A thread owns a ray: the root of |x + t ω − c| = R in front of it."""
     batch, receiver, i = wp.tid()
     own_shell = shell[instance_in(batch, shell.shape[0])]
-    offset = points[instance_in(batch, points.shape[0]), receiver] - center_of(own_shell)
+    point = points[instance_in(batch, points.shape[0]), receiver, instance_in(i, points.shape[2])]
+    offset = point - center_of(own_shell)
     direction = directions[instance_in(batch, directions.shape[0]), receiver, i]
     projection = wp.dot(offset, direction)
     square = projection * projection - wp.dot(offset, offset) + own_shell[3] * own_shell[3]
@@ -69,13 +70,16 @@ def exits_from_shell(points: wp.array, directions: wp.array, shell: wp.array) ->
     """Directions from the center of a shell to where rays meet it.
 
     Args:
-        points: Where rays start, within the shell [scene units], vec3 of shape [batch, receiver].
+        points: Where rays start, within the shell [scene units], vec3 of shape [batch, receiver], or of each ray,
+            [batch, receiver, ray].
         directions: Of the rays, unit vectors, vec3 of shape [batch, receiver, ray].
         shell: Center and radius [scene units], vec4 of shape [batch].
     Returns:
         Unit vectors, vec3 of shape [batch, receiver, ray].
     Differentiable: points, directions, shell.
     """
+    if points.ndim == 2:
+        points = reshaped(points, (*points.shape, 1))
     count = common_batch({"points": points, "directions": directions, "shell": shell})
     exits = empty((count, *directions.shape[1:]), dtype=wp.vec3, device=directions.device)
     launch(_find_exits, exits.shape, inputs=[points, directions, shell], outputs=[exits])
