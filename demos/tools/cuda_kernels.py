@@ -14,12 +14,11 @@ from warpshadow.device.warp_internals import kernel_modules
 from warpshadow.spheres import refine
 from warpshadow.stages.bounces import form_factors, sphere_light
 from warpshadow.stages.convex import coverage as convex
-from warpshadow.stages.gloss import lobes as glossy_lobes
-from warpshadow.stages.gloss import prefilter, traced_lobes
+from warpshadow.stages.gloss import lobes, prefilter, traced_lobes
 from warpshadow.stages.light import transfer
 from warpshadow.stages.raster.interpolation import _make_interpolate
 from warpshadow.stages.ray_traced import shared_rays, traced_transfer
-from warpshadow.stages.self_visibility import gather, lobes, sun_cells, trace
+from warpshadow.stages.self_visibility import gather, self_transfer, sun_cells, trace
 from warpshadow.stages.silhouettes import smooth
 from warpshadow.stages.visibility import directional, exponential, log_sh
 
@@ -55,7 +54,7 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
         for order, is_shadowed in [(2, True), (8, True), (8, False)]
     },
     **{f"_make_sh_product {order}": partial(transfer._make_sh_product, order, LANES) for order in ORDERS},
-    **{f"_make_evaluate_rotated {order}": partial(lobes._make_evaluate_rotated, order) for order in ORDERS},
+    **{f"_make_evaluate_rotated {order}": partial(self_transfer._make_evaluate_rotated, order) for order in ORDERS},
     **{
         f"{make.__name__} {dtype.__name__}": partial(make, dtype)
         for make in (_make_interpolate, batch._make_add, smooth._make_blend, smooth._make_blend_adjoint)
@@ -66,8 +65,8 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
     **{make.__name__: partial(make, LANES) for make in (convex._make_cover, convex._make_cover_adjoint)},
     **{make.__name__: partial(make, LANES) for make in (refine._make_project, refine._make_project_adjoint)},
     **{make.__name__: partial(make, LANES) for make in (gather._make_gather, gather._make_gather_adjoint)},
-    "_make_sample_lobes": lambda: glossy_lobes._make_sample_lobes(LANES)[0],
-    "_make_sample_lobes adjoint": lambda: glossy_lobes._make_sample_lobes(LANES)[1],
+    "_make_sample_lobes": lambda: lobes._make_sample_lobes(LANES)[0],
+    "_make_sample_lobes adjoint": lambda: lobes._make_sample_lobes(LANES)[1],
     "_make_look_up": lambda: prefilter._make_look_up(LANES)[0],
     "_make_look_up adjoint": lambda: prefilter._make_look_up(LANES)[1],
     "trace._make_trace": trace._make_trace,
