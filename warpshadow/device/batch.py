@@ -39,6 +39,11 @@ def instance_in(batch: int, count: int):
     return wp.min(batch, count - 1)
 
 
+def instance_of(batch: Any, instance: int) -> Any:
+    """Item of a batch, an array or a list, for an instance: its own, or the last one, which serves the rest."""
+    return batch[min(instance, len(batch) - 1)]
+
+
 @functools.cache
 def _make_copy(dtype: type) -> wp.Kernel:
     @wp.kernel(module="unique")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from warpshadow.assets.known_light import KnownLight
-from warpshadow.device.batch import common_batch
+from warpshadow.device.batch import common_batch, instance_of
 from warpshadow.device.memory import empty
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
@@ -86,7 +86,7 @@ def path_traced(
         bounced = empty((count, *shading.shape[1:]), dtype=wp.vec3, device=shading.device)
 
         def of_instance(array: wp.array) -> wp.array:
-            return array[min(instance, len(array) - 1)]
+            return instance_of(array, instance)
 
         def textures_of_instance(textures: Textures | None) -> Textures | None:
             return None if textures is None else replace(textures, texels=of_instance(textures.texels).reshape((1, -1)))

@@ -9,6 +9,7 @@ import warp as wp
 
 from warpshadow.assets.basis import Basis, CellBasis, HarmonicBasis
 from warpshadow.assets.known_light import KnownLight
+from warpshadow.device.batch import instance_of
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import ExplainRow, Input, Node, detached
@@ -255,7 +256,7 @@ def _openness(trees: list[FaceTree], receivers: Receivers) -> wp.array:
 def _instances(results: wp.array, *batches: Sequence[Any] | wp.array | np.ndarray) -> Iterator[tuple[Any, ...]]:
     """Results of each instance, unless empty, with its item of each batch; the last item serves the rest."""
     for instance in range(len(results) if results.size else 0):
-        yield results[instance], *(batch[min(instance, len(batch) - 1)] for batch in batches)
+        yield results[instance], *(instance_of(batch, instance) for batch in batches)
 
 
 def _checked_points(points: wp.array) -> wp.array:

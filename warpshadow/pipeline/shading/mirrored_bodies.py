@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
+from warpshadow.device.batch import instance_of
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
@@ -69,14 +70,14 @@ def _find_hits(
     """Trace all instances: arrays of shape [batch, receiver, sample]."""
     hits = [
         trace_hits(
-            merged_scene.mesh(_of(positions, instance)),
+            merged_scene.mesh(instance_of(positions, instance)),
             is_mirror,
             merged_scene.faces,
-            _of(vertex_normals, instance),
-            _of(receivers.points, instance),
-            _of(receivers.normals, instance),
-            _of(directions, instance),
-            _of(transmittance, instance),
+            instance_of(vertex_normals, instance),
+            instance_of(receivers.points, instance),
+            instance_of(receivers.normals, instance),
+            instance_of(directions, instance),
+            instance_of(transmittance, instance),
         )
         for instance in range(len(directions) if directions.size else 0)
     ]
@@ -85,8 +86,3 @@ def _find_hits(
         for instance, part in enumerate(parts):
             wp.copy(array[instance], part)
     return LobeHits(*joined)
-
-
-def _of(array: wp.array, instance: int) -> wp.array:
-    """Array of one instance of a batch; the last instance serves all later ones."""
-    return array[min(instance, len(array) - 1)]

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.device.batch import instance_of
 from warpshadow.device.constants import constant
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch
@@ -260,7 +261,7 @@ def find_corners(receivers: Receivers, instance: int, supersampling: int) -> Cor
     count = receivers.points.shape[1]
     corners = Corners.none(count)
     triangles, face_ids = receivers.faces.numpy(), receivers.fragments.face_ids.numpy()
-    face_ids = face_ids[min(instance, len(face_ids) - 1)]
+    face_ids = instance_of(face_ids, instance)
     pixel_faces = triangles[face_ids]
     pixel_faces = np.where(
         (face_ids >= 0) & (pixel_faces == pixel_faces[..., :1]).all(axis=-1), pixel_faces[..., 0], -1
@@ -277,7 +278,7 @@ def find_corners(receivers: Receivers, instance: int, supersampling: int) -> Cor
     square_ends = np.minimum(square_starts + square_size, np.array(pixel_receivers.shape) - 1)
     rows, columns = np.stack([square_starts, square_ends]).transpose(2, 1, 0)  # each [receiver, 2]
     corner_receivers = pixel_receivers[rows[:, [0, 0, 1, 1]], columns[:, [0, 1, 0, 1]]]
-    points, normals = (item.numpy()[min(instance, len(item) - 1)] for item in (receivers.points, receivers.normals))
+    points, normals = (instance_of(item.numpy(), instance) for item in (receivers.points, receivers.normals))
     offsets = points[corner_receivers] - points[visible_receivers, None]
     heights = np.abs(np.einsum("rcd,rd->rc", offsets, normals[visible_receivers]))
     is_one_surface = np.einsum("rcd,rd->rc", normals[corner_receivers], normals[visible_receivers]) > MIN_SHARED_COSINE
