@@ -23,6 +23,7 @@ from warpshadow.stages.bounces.bright_patches import BrightPatches, find_bright_
 from warpshadow.stages.bounces.form_factors import (
     BLACK_ENTRIES,
     PatchFormFactors,
+    build_loose_tree,
     loose_mesh,
     mean_outside,
     scale_rows,
@@ -31,6 +32,7 @@ from warpshadow.stages.bounces.form_factors import (
     trace_form_factors,
 )
 from warpshadow.stages.bounces.irradiance_cache import choose_cache_points, interpolation_matrix
+from warpshadow.stages.rays.ray_packets import FaceTree
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
@@ -108,7 +110,7 @@ def find_form_factors(
     rays, bright = STILL_RAYS if is_still else RAYS, None
     if light is not None and albedo is not None:
         bright = _bright_patches(light, albedo, mesh, patch_of_sides, senders, rays=rays // _BRIGHT_PART)
-    rays_to_patches = _RaysToPatches(senders, mesh, patch_of_sides, bright, rays, progress)
+    rays_to_patches = _RaysToPatches(senders, mesh, build_loose_tree(mesh), patch_of_sides, bright, rays, progress)
 
     sky = None if sky_at_patch_samples is None else sky_at_patch_samples.numpy()[0, :, 0]
     of_patch_samples = rays_to_patches.trace(patch_samples.points.numpy()[0], patch_samples.normals.numpy()[0], sky)
@@ -138,6 +140,7 @@ class _RaysToPatches(NamedTuple):
 
     senders: Senders
     mesh: wp.Mesh
+    tree: FaceTree  # of its faces
     patch_of_sides: np.ndarray  # of the mesh's faces, int of shape [2, face]
     bright: BrightPatches | None  # to which more rays go
     rays: int  # of a point
@@ -148,7 +151,9 @@ class _RaysToPatches(NamedTuple):
         bodies, senders = self.senders.merged_scene.scene.bodies, self.senders
         count = len(senders.areas) + len(BLACK_ENTRIES)
         inputs = self.mesh, self.patch_of_sides, count, points, normals
-        factors = trace_form_factors(*inputs, rays=self.rays, bright=self.bright, progress=self.progress)
+        factors = trace_form_factors(
+            *inputs, rays=self.rays, bright=self.bright, tree=self.tree, progress=self.progress
+        )
         casts = np.array([body.casts_shadow for body in bodies])[senders.body_of_patch]
         return scale_to_sky(factors, np.append(casts, [True] * len(BLACK_ENTRIES)), sky)
 

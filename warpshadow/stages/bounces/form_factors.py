@@ -141,6 +141,12 @@ def loose_mesh(corners: np.ndarray, *, device: wp.DeviceLike) -> wp.Mesh:
     return wp.Mesh(points, wp.array(np.arange(points.size), dtype=wp.int32, device=device))
 
 
+def build_loose_tree(mesh: wp.Mesh) -> FaceTree:
+    """Build the hierarchy of the faces of a mesh, by which packets of rays miss it at once."""
+    corners = mesh.points.numpy()[mesh.indices.numpy()]
+    return build_face_tree(corners, np.arange(len(corners)).reshape(-1, 3), mesh.device)
+
+
 def trace_form_factors(
     mesh: wp.Mesh,
     patch_of_sides: np.ndarray,
@@ -150,6 +156,7 @@ def trace_form_factors(
     *,
     rays: int = 512,
     bright: BrightPatches | None = None,
+    tree: FaceTree | None = None,
     progress: bool = False,
 ) -> csr_matrix:
     """Trace which patches receivers see.
@@ -168,6 +175,7 @@ def trace_form_factors(
         normals: Unit normals, shape [receiver, 3]. Where one is zero nothing is seen.
         rays: Rays of each receiver in all directions, a multiple of 16.
         bright: Patches of the mesh that more rays are sent to; None for none.
+        tree: Hierarchy of its faces, of :func:`build_loose_tree`; None for one that is built for this call.
         progress: Print how far it is.
     Returns:
         F, float32 of shape [receiver, patch].
@@ -183,8 +191,7 @@ def trace_form_factors(
     patch_array = wp.array(patch_of_sides, dtype=wp.int32, device=device)
     bright = BrightPatches() if bright is None else bright
     ray_count = rays + bright.ray_count
-    corners = mesh.points.numpy()[mesh.indices.numpy()]
-    tree = build_face_tree(corners, np.arange(len(corners)).reshape(-1, 3), device)
+    tree = build_loose_tree(mesh) if tree is None else tree
     lattice = wp.array(packets_of(_lattice(rays)), dtype=_Lane, device=device)
     factors = []
     for receivers in progress_slices(len(points), _MAX_HITS // max(count, 1), progress):
