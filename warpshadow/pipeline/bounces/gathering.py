@@ -146,17 +146,13 @@ class Gathering:
         return add_light(*lights)
 
     def _from_itself(self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
-        receiver_body = group.receiver_body
-        if (
-            receiver_body is None
-            or receiver_body.number not in outgoing.senders.bodies
-            or self._is_flat[receiver_body.number]
-        ):
+        body = outgoing.senders.receiver_body(group)
+        if body is None:
             return None
-        form_factors = self._self_form_factors.of(receiver_body.number)
+        form_factors = self._self_form_factors.of(body.number)
         if form_factors.is_zero:  # a convex body sends itself nothing
             return None
-        return self_light(form_factors, outgoing.of_body(receiver_body.number), *receiver_body.probe_weights)
+        return self_light(form_factors, outgoing.of_body(body.number), *body.probe_weights)
 
     def _from_planes(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance
@@ -186,9 +182,7 @@ class Gathering:
         count = common_batch({"geometry": group.points, "light": proxy_radiance, "proxies": proxies.radii})
         points, normals = expand(group.points, count), expand(group.normals, count)
         spheres = expand(proxies.centers, count), expand(proxies.radii, count)
-        is_same = all(
-            array is of_proxies for array, of_proxies in zip(spheres, (proxies.centers, proxies.radii), strict=True)
-        )
+        is_same = spheres[0] is proxies.centers and spheres[1] is proxies.radii
         return sphere_light(
             *(points, normals, *spheres, proxy_radiance),
             expand_rows(transmittance.transmittance_nonplanar, count),

@@ -65,20 +65,13 @@ class SelfFormFactors:
         """Form factors of each patch sample of a group to the patches of its body, among all patches."""
         from scipy.sparse import csr_matrix
 
-        shape, receiver_body = (group.points.shape[1], len(senders.areas)), group.receiver_body
-        if (
-            receiver_body is None
-            or receiver_body.number not in senders.bodies
-            or senders.merged_scene.is_flat[receiver_body.number]
-        ):
+        shape, body = (group.points.shape[1], len(senders.areas)), senders.receiver_body(group)
+        if body is None:
             return csr_matrix(shape, dtype=np.float32)
-        factors, (probes, weights) = (
-            self.of(receiver_body.number).to_scipy(),
-            (item.numpy()[0] for item in receiver_body.probe_weights),
-        )
+        factors, (probes, weights) = self.of(body.number).to_scipy(), (item.numpy()[0] for item in body.probe_weights)
         starts = np.arange(0, probes.size + 1, 3)
         of_patches = csr_matrix((weights.ravel(), probes.ravel(), starts), (shape[0], factors.shape[0])) @ factors
-        first = senders.first[senders.bodies.index(receiver_body.number)]
+        first = senders.first[senders.bodies.index(body.number)]
         return csr_matrix((of_patches.data, of_patches.indices + first, of_patches.indptr), shape)
 
 
