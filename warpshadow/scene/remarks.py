@@ -15,7 +15,6 @@ from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene
 
-_HALF = 0.5  # share of all light that is looked for in the brightest part of a shell
 _GROUND_COSINE = 0.99  # cosine of the angle to +y up to which a flat body is a ground
 _CEILING_RATIO = 1.01  # ratio of breadths up to which a body is as broad as its ground, such as a ceiling
 _SUN_SHARE = 0.01  # of all directions, from which half of the light comes where there is a sun
@@ -49,6 +48,10 @@ class _Box(NamedTuple):
         return bool((self.low <= other.high).all() and (other.low <= self.high).all())
 
 
+def _boxes_of(scene: Scene) -> list[_Box]:
+    return [_Box(points.min(axis=0), points.max(axis=0)) for points in (b.world_points() for b in scene.bodies)]
+
+
 def misplacements(scene: Scene) -> list[str]:
     """Say which bodies are broader than any ground below, or above or below it by more than their size.
 
@@ -58,7 +61,7 @@ def misplacements(scene: Scene) -> list[str]:
     near enough, a cup on a table, does not float; nor does a lamp, or a body whose bounds meet those of a lamp, such as
     its shade. A body over one ground does not lie below another, such as the board of a table.
     """
-    boxes = [_Box(points.min(axis=0), points.max(axis=0)) for points in (b.world_points() for b in scene.bodies)]
+    boxes = _boxes_of(scene)
 
     def height(number: int) -> float:
         """Of the top of a body."""
@@ -101,7 +104,7 @@ def misplacements(scene: Scene) -> list[str]:
 
 def grounds_of(scene: Scene) -> list[int]:
     """Numbers of the bodies that are grounds, cast shadows, and are as broad as all bodies."""
-    boxes = [_Box(points.min(axis=0), points.max(axis=0)) for points in (b.world_points() for b in scene.bodies)]
+    boxes = _boxes_of(scene)
     broadest = max(box.breadth for box in boxes)
     return [
         number
@@ -159,6 +162,24 @@ def lined_surfaces(scene: Scene) -> list[str]:
     ]
 
 
+class _BrightestHalf(NamedTuple):
+    """The brightest pixels of a map, from which half of its light comes."""
+
+    pixels: np.ndarray  # numbers, from the brightest on
+    powers: np.ndarray  # mean radiance times solid angle, of each of them
+    share: float  # of all directions, that they cover
+
+
+def _brightest_half(light: EnvironmentMap) -> _BrightestHalf:
+    solid_angles = np.repeat(light.solid_angles(), light.radiance.shape[1])
+    luminances = light.radiance.mean(axis=2, dtype=np.float64).ravel()
+    brightest = (-luminances).argsort()
+    powers = (luminances * solid_angles)[brightest]
+    count = int(np.searchsorted(powers.cumsum(), powers.sum() / 2)) + 1
+    pixels = brightest[:count]
+    return _BrightestHalf(pixels, powers[:count], float(solid_angles[pixels].sum() / (4 * np.pi)))
+
+
 def blurred_shell(scene: Scene) -> list[str]:
     """Say that half of the light comes from less of the shell than a cell, by which its shadows are blurred.
 
@@ -167,11 +188,7 @@ def blurred_shell(scene: Scene) -> list[str]:
     light = scene.known_light
     if scene.shell is None or not scene.visibility.traits.has_cells or not isinstance(light, EnvironmentMap):
         return []
-    powers = (light.radiance.mean(axis=2, dtype=np.float64) * light.solid_angles()[:, None]).ravel()
-    solid_angles = np.repeat(light.solid_angles(), light.radiance.shape[1])
-    brightest = (-powers / solid_angles).argsort()
-    half_count = np.searchsorted(powers[brightest].cumsum(), _HALF * powers.sum())
-    share = solid_angles[brightest[: half_count + 1]].sum() / (4 * np.pi)
+    share = _brightest_half(light).share
     if share * scene.direction_count >= 1:
         return []
     return [
@@ -184,26 +201,20 @@ def blurred_shell(scene: Scene) -> list[str]:
 def sun_below(scene: Scene) -> list[str]:
     """Remark on a map whose sun is below the horizon, where a body that casts shadows is a ground, broader than all."""
     light = scene.known_light
-    if (
-        not isinstance(light, EnvironmentMap)
-        or light.shell is not None
-        or len(scene.bodies) < 2
-        or not grounds_of(scene)
-    ):
+    if not isinstance(light, EnvironmentMap) or light.shell is not None or len(scene.bodies) < 2:
         return []
-    solid_angles = np.repeat(light.solid_angles(), light.radiance.shape[1])
-    luminance = light.radiance.mean(axis=2, dtype=np.float64).ravel()
-    brightest = (-luminance).argsort()
-    powers = (luminance * solid_angles)[brightest]
-    sun = brightest[: np.searchsorted(powers.cumsum(), powers.sum() / 2) + 1]
-    if not powers.sum() or solid_angles[sun].sum() > _SUN_SHARE * 4 * np.pi:
+    grounds = grounds_of(scene)
+    if not grounds:
         return []
-    direction = powers[: len(sun)] @ light.directions().reshape(-1, 3)[sun] / powers[: len(sun)].sum()
+    half = _brightest_half(light)
+    if not half.powers.sum() or half.share > _SUN_SHARE:
+        return []
+    direction = half.powers @ light.directions().reshape(-1, 3)[half.pixels] / half.powers.sum()
     length = np.linalg.norm(direction)
     if length < _ONE_SUN or direction[1] > _LOW_SUN:
         return []
     x, y, z = (direction / length).tolist()
-    number = grounds_of(scene)[0]
+    number = grounds[0]
     return [
         f"light: its sun is at ({x:.2g}, {y:.2g}, {z:.2g}), below body {number} ({scene.bodies[number].name!r}), which "
         "keeps its light from the others; y of a direction towards the sun is above 0"
