@@ -83,6 +83,16 @@ def perpendicular_basis(removed: list[np.ndarray]) -> np.ndarray:
     return rows[int((sizes > 1e-9).sum()) :]
 
 
+def turned_direction(start: np.ndarray, turn: torch.Tensor) -> torch.Tensor:
+    """A unit vector turned by angles about two axes that are perpendicular to it [radians], [2]. Differentiable: turn.
+
+    It is where a step of that length leads from ``start`` over the unit sphere.
+    """
+    tangents, start_direction = (torch.tensor(array).to(turn) for array in (perpendicular_basis([start]), start))
+    angle = (turn.square().sum() + 1e-12).sqrt()
+    return angle.cos() * start_direction + angle.sin() / angle * (turn @ tangents)
+
+
 def onto_plane(normal: np.ndarray, fixed: Sequence[str]) -> np.ndarray:
     """The least shift that moves by a unit along a plane's normal, and no fixed coordinate, shape [3].
 

@@ -62,10 +62,7 @@ class Lamp(FreeOfBody):
         middle, start_direction, distance = self._start(setting)
         body = setting.scene.bodies[self.number]
         factor = (_REACH * values["log_distance"]).exp()
-        tangents = setting.tensor(constraints.perpendicular_basis([start_direction]))
-        turn = _REACH * values["turn"]
-        angle = (turn.square().sum() + 1e-12).sqrt()
-        direction = angle.cos() * setting.tensor(start_direction) + angle.sin() / angle * (turn @ tangents)
+        direction = constraints.turned_direction(start_direction, _REACH * values["turn"])
         scale = body.scale * factor
         own_middle = setting.tensor(body.rotation_matrix() @ setting.middle(self.number))
         return setting.tensor(middle) + distance * factor * direction - scale * own_middle, scale

@@ -114,9 +114,7 @@ class Sun(Free):
         """
         start_direction = np.array(self.direction) / np.linalg.norm(self.direction)
         turn = _REACH * values["turn"].double()
-        angle = (turn.square().sum() + 1e-12).sqrt()
-        tangents = torch.tensor(constraints.perpendicular_basis([start_direction])).to(turn)
-        direction = angle.cos() * torch.tensor(start_direction).to(turn) + angle.sin() / angle * (turn @ tangents)
+        direction = constraints.turned_direction(start_direction, turn)
         strength = torch.tensor(self.irradiance).to(turn) * (_REACH * values["log_irradiance"].double()).exp()
         radius = np.radians(self._first_radius) * values["log_radius"].double().exp()
         return direction / direction.norm(), strength, radius
