@@ -13,6 +13,12 @@ from warpshadow.device.memory import empty
 from warpshadow.stages.geometry.rotations import check_orthonormal
 
 
+@wp.func
+def _posed(rotation: wp.mat33, translation: wp.vec3, scale: float, rest: wp.vec3):
+    """S R x + t."""
+    return scale * (rotation * rest) + translation
+
+
 @wp.kernel
 def _pose(
     # in
@@ -35,12 +41,20 @@ def _pose(
     sphere = item - bodies.shape[0]
     if sphere < 0 and batch < posed.shape[0]:
         body = bodies[item]
-        rotated = rotations[pose_batch, body] * rest[instance_in(batch, rest.shape[0]), item]
-        posed[batch, item] = scales[pose_batch, body] * rotated + translations[pose_batch, body]
+        posed[batch, item] = _posed(
+            rotations[pose_batch, body],
+            translations[pose_batch, body],
+            scales[pose_batch, body],
+            rest[instance_in(batch, rest.shape[0]), item],
+        )
     if sphere >= 0 and batch < radii.shape[0]:
         body = sphere_bodies[sphere]
-        rotated = rotations[pose_batch, body] * rest_centers[instance_in(batch, rest_centers.shape[0]), sphere]
-        centers[batch, sphere] = scales[pose_batch, body] * rotated + translations[pose_batch, body]
+        centers[batch, sphere] = _posed(
+            rotations[pose_batch, body],
+            translations[pose_batch, body],
+            scales[pose_batch, body],
+            rest_centers[instance_in(batch, rest_centers.shape[0]), sphere],
+        )
         radii[batch, sphere] = scales[pose_batch, body] * rest_radii[instance_in(batch, rest_radii.shape[0]), sphere]
 
 
