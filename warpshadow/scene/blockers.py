@@ -197,7 +197,7 @@ def free_shape_remark(scene: Scene, number: int) -> str:
 def why_spheres_block(scene: Scene, number: int) -> str:
     """Why a body that casts shadows blocks light by spheres, in words after a colon."""
     visibility, body = scene.visibility.with_method(), scene.bodies[number]
-    if visibility.method != "directional":
+    if not visibility.traits.has_cells:
         return f": {visibility.method} has no planes and no convex parts"
     if not isinstance(body.blockers, str):
         return ": its blockers ask for them"
