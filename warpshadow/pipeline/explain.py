@@ -23,7 +23,7 @@ class Decision:
 class StageReport:
     """A stage of a call; it is true if it runs."""
 
-    name: str  # name of the stage
+    name: str
     forward: Decision  # whether it is computed
     backward: Decision  # whether its adjoint is, when gradients are played back
     items: str  # on how many items, in words

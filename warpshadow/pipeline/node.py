@@ -115,7 +115,7 @@ class ExplainRow(NamedTuple):
     Items and idle may be functions that make the words.
     """
 
-    name: str  # its name
+    name: str
     items: str | Callable[[], str] = ""  # on how many items it is computed, in words
     idle: str | Callable[[], str] = ""  # why there is nothing to do, in words
     has_adjoint: bool = True  # whether gradients take it more than to hand them on

@@ -37,9 +37,7 @@ ALGORITHM_VERSION = 11  # part of the key of cached fits: raise it whenever a fi
 STEPS = 320  # of stage 2: 2000 are no better on a bunny
 
 RECEIVERS = 8192  # receivers that stage 2 draws from
-SHADOW_SPHERES = (
-    64  # spheres from which on one expects the shadow of the mesh. A flat body, which rarely needs any, has so many
-)
+SHADOW_SPHERES = 64  # from so many on one expects the shadow of the mesh. A flat body, which rarely needs any, has them
 
 BAD_SHADOW = 0.18  # error of a shadow above which it is ragged: a fence has 0.21, rocks, whose shadow is whole, 0.16
 MIN_GROUND_ERROR = 0.01  # of a ground, below which ragged shadows are not visible: of a slab that lies on it, 0.004

@@ -45,7 +45,7 @@ class Loop:
     """Paints for any number of pages."""
 
     def __init__(self, paint: Paint, viewer_state: ViewerState, *, rest: float = REST):
-        self.viewer_state = viewer_state  # the viewer state
+        self.viewer_state = viewer_state
         self.depth = False  # whether pages are sent how far away everything is
         self._paint, self._rest = paint, rest
         self._painting = threading.Lock()

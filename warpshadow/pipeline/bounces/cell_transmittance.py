@@ -53,13 +53,9 @@ def find_cell_transmittance(
     else:
         directions, transmittance_self = HARMONIC_GATHER_CELLS, None
         transmittance_nonplanar = _transmittance(method, group, merged_scene.nonplanar_bodies, spheres, directions)
-    receiver_body = group.receiver_body
-    if (
-        transmittance_self is None
-        and receiver_body is not None
-        and not (receiver_body.is_solid or merged_scene.is_flat[receiver_body.number])
-    ):
-        transmittance_self = _transmittance(method, group, [receiver_body.number], spheres, directions)
+    body = group.receiver_body
+    if transmittance_self is None and body is not None and not (body.is_solid or merged_scene.is_flat[body.number]):
+        transmittance_self = _transmittance(method, group, [body.number], spheres, directions)
     if transmittance_nonplanar is None:
         transmittance_nonplanar = wp.full(
             (*group.points.shape, len(directions)), 1.0, wp.float32, device=group.points.device

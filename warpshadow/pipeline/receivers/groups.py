@@ -145,13 +145,11 @@ class Group:
 
         For a gradient all of them come at once, and so do receivers with cached rows.
         """
-        receiver_body, planes, clusters = self.receiver_body, self.planes, self.clusters
-        rotation_data = None if receiver_body is None or receiver_body.lookup is None else receiver_body.lookup.turned
-        positions = (
-            None if receiver_body is None or receiver_body.body_sides is None else receiver_body.body_sides.positions
-        )
+        body, planes, clusters = self.receiver_body, self.planes, self.clusters
+        rotation_data = None if body is None or body.lookup is None else body.lookup.turned
+        positions = None if body is None or body.body_sides is None else body.body_sides.positions
         frames = None if planes is None else planes.frames
-        parts = self.convex_parts_around or (None if receiver_body is None else receiver_body.parts)
+        parts = self.convex_parts_around or (None if body is None else body.parts)
         part_corners = None if parts is None else parts.placed_parts.corners
         arguments = points, normals, centers, radii = self.points, self.normals, self.centers, self.radii
         others = {"rotations": rotation_data, "planes": frames, "positions": positions, "parts": part_corners}
@@ -174,7 +172,7 @@ class Group:
                 normals=normals[:, portion].contiguous(),
                 centers=centers,
                 radii=radii,
-                receiver_body=None if receiver_body is None else receiver_body.cut(portion),
+                receiver_body=None if body is None else body.cut(portion),
                 footprints=None if footprints is None else footprints[:, portion].contiguous(),
                 nearest_blockers=None if self.nearest_blockers is None else self.nearest_blockers.cut(portion),
                 clusters=clusters,

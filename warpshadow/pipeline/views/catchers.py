@@ -58,9 +58,8 @@ class CatchersAlone:
         catcher_view = views.view(inputs.geometry, inputs.clip_matrices)
         catcher_values = {name: [items[number] for number in self._numbers] for name, items in scene_values.items()}
         materials = catcher_view.materials.replaced(catcher_values)
-        if (
-            scene.visibility.traits.every_sample_receives
-        ):  # rays are drawn by a receiver's number: the same for both views
+        # rays are drawn by a receiver's number: the same for both views
+        if scene.visibility.traits.every_sample_receives:
             catcher_view = catcher_view.at_receivers_of(view)
         # an input of their own: their method and view cache other nodes of the same light
         light = catcher_view.method.light_input(catcher_view, inputs.light, inputs.shell)

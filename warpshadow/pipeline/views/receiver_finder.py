@@ -76,9 +76,8 @@ class ReceiverFinder:
         if not is_readable(merged_scene.device):
             numbering = scene_receivers.number_all(self._blocker_kinds, has_backs, self._static_bodies)
         else:
-            has_cached_rows = (
-                scene_receivers.is_adaptive & self._bodies_with_cached_rows()
-            )  # cheaper than receivers at samples
+            # cached rows are cheaper than receivers at samples
+            has_cached_rows = scene_receivers.is_adaptive & self._bodies_with_cached_rows()
             at_samples = at_samples & ~has_cached_rows
             numbering = self._number_seen(seen_vertices(fragments, silhouettes, positions.shape[1]), has_cached_rows)
             if spheres is not None and (is_adaptive := scene_receivers.is_adaptive & at_samples).any():
@@ -107,11 +106,8 @@ class ReceiverFinder:
             has_mean_slope=has_mean_slope,
             shares_receivers=None if method.shares_lobes else gather_of_owners(~merged_scene.is_glossy, body_of_face),
         )
-        if (
-            receivers.sample_fragments is None
-            or not method.edges_as_wide_as_footprints
-            or not self._footprint_widths.any()
-        ):
+        widens = method.edges_as_wide_as_footprints
+        if receivers.sample_fragments is None or not (widens and self._footprint_widths.any()):
             return receivers
         return receivers._replace(footprints=footprints_of(receivers.sample_fragments, receivers.points.shape))
 

@@ -186,7 +186,7 @@ def receiver_lanes_type(lanes: int) -> Any:
 
 @functools.cache
 def make_load_receivers(has_horizon: bool, lanes: int) -> wp.Function:
-    """Make the kernel function that loads a block of receivers that are points: inputs, row → instance, block, they."""
+    """Make the kernel function that loads receivers without footprints: inputs, row → instance, block, receivers."""
     Lane, Vectors, ReceiverLanes = lane_type(lanes), vectors_type(lanes), receiver_lanes_type(lanes)
     fn = make_lane_functions(lanes)
     find_block, load = fn.find_block, fn.load
