@@ -108,7 +108,7 @@ class ShadingContext:
         self.materials, self.merged_scene = materials, merged_scene
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static_bodies = call, static_bodies
-        self.normals = Node("", vertex_normals, vertices, merged_scene.faces) if normals is None else normals
+        self.normals = Node("", vertex_normals, vertices, merged_scene.one_rings) if normals is None else normals
         self._cached: dict[str, tuple[Hashable, Any]] = {}
         self._cached_of_bodies: dict[str, tuple[Hashable, Any]] = {}
         if neighbors is not None:
