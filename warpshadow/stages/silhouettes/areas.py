@@ -27,7 +27,6 @@ rigid motion), and at edges far below a sample it would outweigh the rest, pulli
 
 import warp as wp
 
-from warpshadow.device.launch import launch
 from warpshadow.stages.raster.screen import (
     direction_sign,
     face_plane,
@@ -81,54 +80,40 @@ def measure_area(fragments: FragmentArrays, sample: int, direction: int, edge: w
     return area_and_weight
 
 
-@wp.kernel(enable_backward=False)
-def _measure_areas_adjoint(
-    # in
-    samples: wp.array(dtype=wp.int32),
-    edges: wp.array2d(dtype=wp.vec2i),
+@wp.func
+def measure_area_adjoint(
     fragments: FragmentArrays,
-    adj_areas: wp.array2d(dtype=wp.float32),
-    # out
+    sample: int,
+    direction: int,
+    edge: wp.vec2i,
+    adj_area: float,
     adj_clip_positions: wp.array2d(dtype=wp.vec4),
 ):
-    """A thread owns a direction of an entry: it adds to the gradients of the line's vertices."""
-    entry, direction = wp.tid()
-    edge = edges[entry, direction]
-    adj_area = adj_areas[entry, direction]
-    if edge[0] != NOTHING and adj_area != 0.0:
-        axis = direction / 2
-        sample = samples[entry]
-        batch = image_index(fragments, sample)
-        clip = fragments.clip_positions[batch]
-        samples_per_unit = half_size(fragments.width, fragments.height)
-        center = sample_center(sample, fragments.width, fragments.height)
-        line = line_between(fragments, sample, direction, edge)
-        distance = wp.clamp(line_distance(line, direction, samples_per_unit), 0.0, 1.0)
-        area_slope, _ = wp.grad(_area_beyond)(distance, wp.min(line_slope(line, direction, samples_per_unit), 1.0))
-        # of the line's x in a row, or its y in a column
-        adj_position = direction_sign(direction) * adj_area * area_slope * samples_per_unit[axis]
-        if edge[0] >= 0:
-            adj_a, adj_b = edge_position_adjoint(edge, center, axis, adj_position, clip)
-            wp.atomic_add(adj_clip_positions, batch, edge[0], adj_a)
-            wp.atomic_add(adj_clip_positions, batch, edge[1], adj_b)
-        else:
-            for end in range(2):
-                fragment = sample
-                sign = float(1.0)
-                if end == 1:
-                    fragment = neighbor(sample, direction, fragments.width)
-                    sign = -1.0
-                corners = fragments.faces[fragments.face_ids[fragment]]
-                ray = sample_center(fragment, fragments.width, fragments.height)
-                normal = face_plane(corners, ray, clip)
-                adj_clip = sign * adj_position * (normal[2] / line[axis]) * relative_to_ray_adjoint(ray, normal)
-                for k in range(3):
-                    wp.atomic_add(adj_clip_positions, batch, corners[k], fragments.barycentrics[fragment][k] * adj_clip)
-
-
-def measure_areas_adjoint(samples: wp.array, edges: wp.array, arrays: FragmentArrays, adj_areas: wp.array) -> None:
-    """The adjoint of the areas e, float32 of shape [entry, 4]: add to the gradient of the clip positions."""
-    adj_clip_positions = arrays.clip_positions.grad
-    launch(
-        _measure_areas_adjoint, edges.shape, inputs=[samples, edges, arrays, adj_areas], outputs=[adj_clip_positions]
-    )
+    """The adjoint of `measure_area` by the area: it adds to the gradients of the line's vertices."""
+    axis = direction / 2
+    batch = image_index(fragments, sample)
+    clip = fragments.clip_positions[batch]
+    samples_per_unit = half_size(fragments.width, fragments.height)
+    center = sample_center(sample, fragments.width, fragments.height)
+    line = line_between(fragments, sample, direction, edge)
+    distance = wp.clamp(line_distance(line, direction, samples_per_unit), 0.0, 1.0)
+    area_slope, _ = wp.grad(_area_beyond)(distance, wp.min(line_slope(line, direction, samples_per_unit), 1.0))
+    # of the line's x in a row, or its y in a column
+    adj_position = direction_sign(direction) * adj_area * area_slope * samples_per_unit[axis]
+    if edge[0] >= 0:
+        adj_a, adj_b = edge_position_adjoint(edge, center, axis, adj_position, clip)
+        wp.atomic_add(adj_clip_positions, batch, edge[0], adj_a)
+        wp.atomic_add(adj_clip_positions, batch, edge[1], adj_b)
+    else:
+        for end in range(2):
+            fragment = sample
+            sign = float(1.0)
+            if end == 1:
+                fragment = neighbor(sample, direction, fragments.width)
+                sign = -1.0
+            corners = fragments.faces[fragments.face_ids[fragment]]
+            ray = sample_center(fragment, fragments.width, fragments.height)
+            normal = face_plane(corners, ray, clip)
+            adj_clip = sign * adj_position * (normal[2] / line[axis]) * relative_to_ray_adjoint(ray, normal)
+            for k in range(3):
+                wp.atomic_add(adj_clip_positions, batch, corners[k], fragments.barycentrics[fragment][k] * adj_clip)
