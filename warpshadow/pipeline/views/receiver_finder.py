@@ -7,6 +7,7 @@ import warp as wp
 
 from warpshadow.device.constants import constant, gather_of_owners
 from warpshadow.device.cuda_graph import is_readable
+from warpshadow.device.launch import without_gradient
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
 from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
@@ -72,7 +73,8 @@ class ReceiverFinder:
         quadtree, has_mean_slope = None, None
         size = fragments.face_ids.shape[1] // self._supersampling, fragments.face_ids.shape[2] // self._supersampling
         widths = constant(self._footprint_widths, wp.float32, merged_scene.device)
-        footprint_inputs = FootprintInputs(clip_positions, widths, wp.vec2(2.0 / size[1], 2.0 / size[0]))
+        pixel = wp.vec2(2.0 / size[1], 2.0 / size[0])
+        footprint_inputs = FootprintInputs(without_gradient(clip_positions), widths, pixel)
         has_backs, at_samples = fragments.sides is not None, scene_receivers.at_samples(self._blocker_kinds)
         if not is_readable(merged_scene.device):
             numbering = scene_receivers.number_all(self._blocker_kinds, has_backs, self._static_bodies)
