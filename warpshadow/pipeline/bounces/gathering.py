@@ -50,7 +50,6 @@ class OutgoingRadiance:
         placed_proxies: Their proxies, in the world.
         frames: Where flat bodies are, vec3 of shape [batch, 3 · plane].
         patch_weights: Of the patches, vec3 of shape [batch, patch].
-        texel_weights: Their sums of each texel of flat bodies, vec3 of shape [batch, texel]; None without any.
     """
 
     def __init__(
@@ -60,11 +59,9 @@ class OutgoingRadiance:
         placed_proxies: PlacedProxies,
         frames: wp.array,
         patch_weights: wp.array,
-        texel_weights: wp.array | None,
     ):
         self.proxies, self.senders, self.radiosity = proxies, proxies.senders, radiosity
-        self.placed_proxies, self.frames = placed_proxies, frames
-        self.patch_weights, self.texel_weights = patch_weights, texel_weights
+        self.placed_proxies, self.frames, self.patch_weights = placed_proxies, frames, patch_weights
 
     def of_body(self, body: int) -> wp.array:
         """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
@@ -87,7 +84,7 @@ class OutgoingRadiance:
     def texels(self) -> wp.array:
         """Radiosity of the flat bodies, vec3 of shape [batch, texel]."""
         assert self.proxies.planes is not None
-        return find_texels(self.radiosity, self.patch_weights, self.proxies.planes.blockers, self.texel_weights)
+        return find_texels(self.radiosity, self.patch_weights, self.proxies.planes.blockers)
 
 
 class Gathering:

@@ -19,7 +19,7 @@ from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.sides import split_side, split_sides
 from warpshadow.stages.receivers.quadtree import Quadtree
-from warpshadow.stages.receivers.receiver_footprints import FootprintInputs, find_footprint
+from warpshadow.stages.receivers.receiver_footprints import FootprintInputs, find_pixel_area
 from warpshadow.stages.receivers.receiver_means import VisibleSurface
 from warpshadow.stages.receivers.sample_receivers import Span, find_sample_receivers, spans_of
 from warpshadow.stages.silhouettes.find import Silhouettes
@@ -136,7 +136,7 @@ def _gather_points(
             width = footprint_widths[face]
             if side >= 0 and width > 0.0:
                 clip = clip_positions[instance_in(batch, clip_positions.shape[0])]
-                area = find_footprint(positions[position_batch], clip, faces[face], weights, pixel)
+                area = find_pixel_area(positions[position_batch], clip, faces[face], weights, pixel)
                 footprint = width * width * area
     if footprints:
         footprints[batch, receiver] = footprint

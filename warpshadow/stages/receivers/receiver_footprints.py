@@ -20,7 +20,7 @@ class FootprintInputs(NamedTuple):
 
 
 @wp.func
-def find_footprint(
+def find_pixel_area(
     positions: wp.array(dtype=wp.vec3),
     clip_positions: wp.array(dtype=wp.vec4),
     corners: wp.vec3i,
@@ -41,13 +41,13 @@ def find_footprint(
     return wp.cross(by_x[1] * along_b + by_x[2] * along_c, by_y[1] * along_b + by_y[2] * along_c)
 
 
-@wp.func_grad(find_footprint)
-def _find_footprint_adjoint(
+@wp.func_grad(find_pixel_area)
+def _find_pixel_area_adjoint(
     positions: wp.array(dtype=wp.vec3),
     clip_positions: wp.array(dtype=wp.vec4),
     corners: wp.vec3i,
     weights: wp.vec3,
     pixel: wp.vec2,
-    adj_footprint: wp.vec3,
+    adj_area: wp.vec3,
 ):
     return
