@@ -248,7 +248,13 @@ def test_gradients_of_light_from_spheres_are_exact(double, device, check, sphere
     sphere_light = double("stages.bounces.sphere_light").sphere_light
     proxy_radiance, unblocked = 1 + random(0, 1, 4, 16, 4) ** 2, 1 + random(1, 1, 5, 16) ** 2
     rest = (wp.vec4d, proxy_radiance), (wp.float64, 0.5 * unblocked), (wp.float64, unblocked)
-    check(lambda *scene: sphere_light(*scene, directions, softness=1.2), *spheres, *rest)
+    addend = wp.vec3d, random(2, *spheres[0][1].shape)
+
+    def light(*scene_and_addend):
+        *scene, addend = scene_and_addend
+        return sphere_light(*scene, directions, softness=1.2, addend=addend)
+
+    check(light, *spheres, *rest, addend)
 
 
 @pytest.mark.slow
@@ -316,7 +322,12 @@ def test_gradients_of_light_of_planes_are_exact(double, planes, check):
     openness = np.random.default_rng(1).uniform(0.02, 1, size=radiosity.shape[:2])[..., None] * np.ones(3)
     fixed, is_open = (wp.array(value, dtype=wp.vec3d, device=planes.grids.device) for value in (radiosity, openness))
     texels = double("stages.bounces.plane_texels").find_texels(fixed, is_open, planes)
-    check(lambda *scene: plane_light(*scene, texels, planes, directions), *given)
+    addend = wp.vec3d, random(2, *points.shape)
+
+    def light(points, normals, transmittance, frames, addend):
+        return plane_light(points, normals, transmittance, frames, texels, planes, directions, addend=addend)
+
+    check(light, *given, addend)
 
 
 def test_gradients_of_transmittance_past_planes_are_exact(double, planes, check):
@@ -451,10 +462,11 @@ def test_gradients_of_radiosity_and_self_light_are_exact(double, device, check):
     factors = sparse.from_matrix(np.abs(random(0, 5, 3)), device=device)
     rows = put(np.array([[[0, 1, 2], [4, 4, 3]]]), wp.vec3i, device)
 
-    def light(albedo, shading, weights):
-        return self_light(factors, radiosity.patch_radiosity(albedo, shading, mean), rows, weights)
+    def light(albedo, shading, weights, addend):
+        return self_light(factors, radiosity.patch_radiosity(albedo, shading, mean), rows, weights, addend)
 
-    check(light, (wp.vec3d, random(1, 1, 3, 3)), (wp.vec3d, random(2, 2, 3, 3)), (wp.vec3d, random(3, 1, 2, 3)))
+    sent = (wp.vec3d, random(1, 1, 3, 3)), (wp.vec3d, random(2, 2, 3, 3))
+    check(light, *sent, (wp.vec3d, random(3, 1, 2, 3)), (wp.vec3d, random(4, 1, 2, 3)))
 
 
 def logs(*sizes, order=3):

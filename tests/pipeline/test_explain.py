@@ -470,7 +470,7 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
     if module.startswith(of_visibility) or key == "_add_cached_rows":
         return VISIBILITY
     if module.startswith("stages.silhouettes"):
-        after = {"_find_edge_colors": "radiance", "blend": "smoothing", "_measure_areas_adjoint": "smoothing"}
+        after = {"_find_edge_colors": "radiance", "blend": "smoothing"}
         return next((name for part, name in after.items() if part in key), "silhouettes")
     if module.startswith("stages.textures"):
         if "_sample" in key:  # given the samples of white surfaces, it exposes them

@@ -12,7 +12,7 @@ from warpshadow import check
 from warpshadow.device.batch import accumulate, common_batch, expand, instance_in
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
-from warpshadow.device.parallel import split_row
+from warpshadow.device.parallel import run_length, split_row
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix, sparray, spmatrix
@@ -103,6 +103,42 @@ def _multiply(
         products[batch, row] = product
 
 
+@wp.kernel(enable_backward=False)
+def _multiply_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    column_starts: wp.array(dtype=wp.int32),
+    rows: wp.array(dtype=wp.int32),
+    weights: wp.array(dtype=wp.float32),
+    row_scales: wp.array2d(dtype=wp.vec3),
+    values: wp.array2d(dtype=wp.vec3),
+    column_scales: wp.array2d(dtype=wp.vec3),
+    adj_products: wp.array2d(dtype=wp.vec3),
+    run: int,
+    # out
+    adj_values: wp.array2d(dtype=wp.vec3),
+    adj_column_scales: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a run of columns of an instance:  with u = Mᵀ (r ∘ p̄),  v̄ += s ∘ u,  s̄ += v ∘ u."""
+    column_count = column_starts.shape[0] - 1
+    batch, thread = split_row(first_row + wp.tid(), (column_count + run - 1) // run)
+    for column in range(thread * run, wp.min((thread + 1) * run, column_count)):
+        adj = wp.vec3()
+        for entry in range(column_starts[column], column_starts[column + 1]):
+            adj_product = adj_products[batch, rows[entry]]
+            if row_scales:
+                adj_product = wp.cw_mul(row_scales[instance_in(batch, row_scales.shape[0]), rows[entry]], adj_product)
+            adj += weights[entry] * adj_product
+        if adj_column_scales:
+            adj_scale = wp.cw_mul(values[batch, column], adj)
+            adj_column_scales[batch, column] = adj_column_scales[batch, column] + adj_scale
+        if adj_values:
+            if column_scales:
+                adj = wp.cw_mul(column_scales[instance_in(batch, column_scales.shape[0]), column], adj)
+            adj_values[batch, column] = adj_values[batch, column] + adj
+
+
 def multiply(
     matrix: SparseMatrix,
     values: wp.array,
@@ -136,34 +172,29 @@ def multiply(
         for scales in (row_scales, column_scales)
     )
 
-    def multiply_entries(
-        entries: Entries,
-        factors: wp.array,
-        column_scales: wp.array | None,
-        row_scales: wp.array | None,
-        addend: wp.array | None,
-        products: wp.array,
-    ) -> None:
-        batch_count, row_count = products.shape
-        run = 1 if products.device.is_cuda else _RUN
+    run = run_length(values.device, _RUN)
+
+    def launch_rows(kernel: wp.Kernel, entries: Entries, inputs: list, outputs: list) -> None:
+        row_count = len(entries.row_starts) - 1
         cost = run * (_ENTRY_COST * entries.columns.size / max(row_count, 1) + _ROW_COST)
-        inputs = [*entries, factors, column_scales, row_scales, addend, run]
-        launch(_multiply, batch_count * -(-row_count // run), inputs=inputs, outputs=[products], cost=cost)
+        inputs = [*entries, *inputs, run]
+        launch(kernel, count * -(-row_count // run), inputs=inputs, outputs=outputs, cost=cost)
+
+    def multiply_rows(row_scales: wp.array | None, addend: wp.array | None, products: wp.array) -> None:
+        launch_rows(_multiply, matrix.rows, [values, column_scales, row_scales, addend], [products])
 
     def adjoint(adj_products: wp.array) -> None:
-        transposed = matrix.columns, adj_products, row_scales
-        if values.requires_grad:
-            multiply_entries(*transposed, column_scales, values.grad, values.grad)
-        if column_scales is not None and column_scales.requires_grad:
-            multiply_entries(*transposed, values, column_scales.grad, column_scales.grad)
+        adj_scales = None if column_scales is None else column_scales.grad
+        if values.requires_grad or adj_scales is not None:
+            inputs = [row_scales, values, column_scales, adj_products]
+            launch_rows(_multiply_adjoint, matrix.columns, inputs, [values.grad, adj_scales])
         if row_scales is not None and row_scales.requires_grad:
-            grad = row_scales.grad
-            multiply_entries(matrix.rows, values, column_scales, adj_products, grad, grad)
+            multiply_rows(adj_products, row_scales.grad, row_scales.grad)
         if addend is not None and addend.requires_grad:
             accumulate(adj_products, addend.grad)
 
     return differentiable(
-        lambda products: multiply_entries(matrix.rows, values, column_scales, row_scales, addend, products),
+        lambda products: multiply_rows(row_scales, addend, products),
         adjoint,
         result=empty((count, row_count), dtype=wp.vec3, device=values.device),
         variables=[values, addend, row_scales, column_scales],

@@ -68,7 +68,7 @@ class PointSample:
         if not len(chosen_samples):
             raise ValueError("scene: the camera sees no body, expected one in the image")
         positions = stage.geometry().positions.numpy()[0]
-        normals = vertex_normals(stage.geometry().positions, stage.merged_scene.faces).numpy()[0]
+        normals = vertex_normals(stage.geometry().positions, stage.merged_scene.one_rings).numpy()[0]
         # the backs of vertices are numbered after them
         self._positions, self._normals = np.tile(positions, (2, 1)), np.concatenate([normals, -normals])
         self._sides, self._vertices, self._weights = seen_on_faces(self._view, chosen_samples)

@@ -20,6 +20,7 @@ from warpshadow.scene.blockers import scene_blockers
 from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.scene.visibility import AUTO
 from warpshadow.spheres import SHADOW_SPHERES, Spheres
+from warpshadow.stages.geometry.normals import OneRings
 from warpshadow.stages.geometry.poses import Poses
 
 if TYPE_CHECKING:  # it is imported where a body emits
@@ -47,7 +48,7 @@ class MergedScene:
         self.device = wp.get_device(device)
         self.has_chosen_receivers = np.zeros(len(scene.bodies), bool)
         self._progress = progress
-        self._faces_of: dict[tuple[int, int], wp.array] = {}
+        self._rings_of: dict[tuple[int, int], OneRings] = {}
         self._take_spheres: Callable[[], list[Spheres]] | None = None
         meshes = [body.mesh for body in scene.bodies]
         uvs = [np.zeros((1, 2), np.float32) if mesh.uvs is None else mesh.uvs for mesh in meshes]
@@ -434,13 +435,18 @@ class MergedScene:
         faces = self.faces.numpy()[keeps_face]
         return wp.Mesh(wp.clone(positions, requires_grad=False), self._array(faces.ravel(), wp.int32))
 
-    def faces_of(self, first: int, end: int) -> wp.array:
-        """Faces of consecutive bodies, given where their vertices begin and end: vec3i, indices from ``first`` on."""
-        if (first, end) not in self._faces_of:
+    @functools.cached_property
+    def one_rings(self) -> OneRings:
+        """The faces around each vertex, for normals."""
+        return self.rings_of(0, int(self.first_vertex[-1]))
+
+    def rings_of(self, first: int, end: int) -> OneRings:
+        """The faces around the vertices of consecutive bodies, which have numbers from ``first`` on."""
+        if (first, end) not in self._rings_of:
             faces = self.faces.numpy()
             of_bodies = faces[(faces[:, 0] >= first) & (faces[:, 0] < end)] - first
-            self._faces_of[first, end] = self._array(of_bodies, wp.vec3i)
-        return self._faces_of[first, end]
+            self._rings_of[first, end] = OneRings.of_faces(of_bodies, end - first, device=self.device)
+        return self._rings_of[first, end]
 
     @functools.cached_property
     def _vertex_bodies(self) -> wp.array:

@@ -25,7 +25,6 @@ from warpshadow.stages.bounces.plane_texels import find_texels
 from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance
 from warpshadow.stages.bounces.self_light import self_light
 from warpshadow.stages.bounces.sphere_light import sphere_light
-from warpshadow.stages.light.sums import add_light
 
 ALL_FLAT = "all that reflects is flat"  # why no body sends light to itself, in words
 
@@ -51,7 +50,6 @@ class OutgoingRadiance:
         placed_proxies: Their proxies, in the world.
         frames: Where flat bodies are, vec3 of shape [batch, 3 · plane].
         patch_weights: Of the patches, vec3 of shape [batch, patch].
-        texel_weights: Their sums of each texel of flat bodies, vec3 of shape [batch, texel]; None without any.
     """
 
     def __init__(
@@ -61,11 +59,9 @@ class OutgoingRadiance:
         placed_proxies: PlacedProxies,
         frames: wp.array,
         patch_weights: wp.array,
-        texel_weights: wp.array | None,
     ):
         self.proxies, self.senders, self.radiosity = proxies, proxies.senders, radiosity
-        self.placed_proxies, self.frames = placed_proxies, frames
-        self.patch_weights, self.texel_weights = patch_weights, texel_weights
+        self.placed_proxies, self.frames, self.patch_weights = placed_proxies, frames, patch_weights
 
     def of_body(self, body: int) -> wp.array:
         """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
@@ -88,7 +84,7 @@ class OutgoingRadiance:
     def texels(self) -> wp.array:
         """Radiosity of the flat bodies, vec3 of shape [batch, texel]."""
         assert self.proxies.planes is not None
-        return find_texels(self.radiosity, self.patch_weights, self.proxies.planes.blockers, self.texel_weights)
+        return find_texels(self.radiosity, self.patch_weights, self.proxies.planes.blockers)
 
 
 class Gathering:
@@ -137,49 +133,51 @@ class Gathering:
 
         ``node`` has the stages. The result is vec3 of shape [batch, receiver].
         """
-        lights = [portion.direct]
+        light = portion.direct
         for stage, function in zip(self.stages, self._functions, strict=True):
             if not stage.idle:
                 with node.timed(call, stage):
-                    bounced = function(portion.group, portion.transmittance, outgoing)
-                lights += [] if bounced is None else [bounced]
-        return add_light(*lights)
+                    light = function(portion.group, portion.transmittance, outgoing, light)
+        return light
 
-    def _from_itself(self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance) -> wp.array | None:
+    def _from_itself(
+        self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array
+    ) -> wp.array:
         body = outgoing.senders.receiver_body(group)
         if body is None:
-            return None
+            return others
         form_factors = self._self_form_factors.of(body.number)
         if form_factors.is_zero:  # a convex body sends itself nothing
-            return None
-        return self_light(form_factors, outgoing.of_body(body.number), *body.probe_weights)
+            return others
+        return self_light(form_factors, outgoing.of_body(body.number), *body.probe_weights, others)
 
     def _from_planes(
-        self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance
-    ) -> wp.array | None:
+        self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array
+    ) -> wp.array:
         planes = outgoing.proxies.planes
         assert planes is not None
         skip = planes.index_of_body.get(group.body)
         if planes.blockers.count == (skip is not None):
-            return None
+            return others
         fronts = group.find_fronts(outgoing.frames, planes.blockers, skip)
         # Planes are seen through the middles of cells. Through transmittance.directions, where skylight comes from,
         # which are above horizons, a ball on a ground lost 4% of the ground's light.
         middles = fibonacci(len(transmittance.directions))
         arguments = fronts.lifted_points, group.normals, transmittance.transmittance_nonplanar, outgoing.frames
         options = {"coverages": transmittance.part_coverages, "front_weights": fronts.front_weights, "skip": skip}
-        return plane_light(*arguments, outgoing.texels, planes.blockers, middles, **options)
+        return plane_light(*arguments, outgoing.texels, planes.blockers, middles, **options, addend=others)
 
     def _from_spheres(
-        self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance
-    ) -> wp.array | None:
+        self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array
+    ) -> wp.array:
         if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):
-            return None
+            return others
         proxies, proxy_radiance = outgoing.placed_proxies, outgoing.proxy_radiance
         softness = self._visibility.softness
         if group.convex_parts_around is not None:
             softness = max(softness, _SOFTNESS_OF_PARTS)
-        count = common_batch({"geometry": group.points, "light": proxy_radiance, "proxies": proxies.radii})
+        geometry = {"geometry": group.points, "proxies": proxies.radii}
+        count = common_batch({**geometry, "light": proxy_radiance, "other light": others})
         points, normals = expand(group.points, count), expand(group.normals, count)
         spheres = expand(proxies.centers, count), expand(proxies.radii, count)
         is_same = spheres[0] is proxies.centers and spheres[1] is proxies.radii
@@ -193,4 +191,5 @@ class Gathering:
             skip=outgoing.proxies.span_of(group.body),
             clusters=proxies.clusters if is_same else None,
             tangent_planes=proxies.tangent_planes,
+            addend=others,
         )

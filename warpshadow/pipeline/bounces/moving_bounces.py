@@ -41,7 +41,6 @@ from warpshadow.pipeline.shading.sphere_method import (
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
-from warpshadow.stages.bounces.plane_texels import sum_weights
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.receivers.find import Receivers
@@ -179,11 +178,8 @@ class Radiosity(Node):
         if self_factors is not None and self_factors.is_zero:
             self_factors = None
 
-        planes = self._proxies.planes
-        texel_weights = None if planes is None else sum_weights(weights.weights, planes.blockers)
-
         def outgoing_of(radiosity: wp.array) -> OutgoingRadiance:
-            return OutgoingRadiance(self._proxies, radiosity, placed_proxies, frames, weights.weights, texel_weights)
+            return OutgoingRadiance(self._proxies, radiosity, placed_proxies, frames, weights.weights)
 
         def radiosity_by_others(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""

@@ -34,7 +34,7 @@ def find_squares(
             sharpest shadows, shape [batch, receiver]; None where nothing blocks.
         surfaces: The samples, and the bodies; no gradient passes to them.
     """
-    positions, normals, fragments, spheres, is_adaptive, supersampling, footprints_of = surfaces
+    positions, normals, fragments, spheres, is_adaptive, supersampling, footprint_inputs = surfaces
     positions, normals, centers, radii = map(without_gradient, (positions, normals, *spheres))
     with unrecorded():
         blockers = place_blockers(positions, (centers, radii))
@@ -51,9 +51,8 @@ def find_squares(
             if not columns.shape[1]:
                 continue
             seen = fragments_of_samples(fragments, probes[columns])
-            points_and_normals = points_of_fragments(positions, normals, merged_scene.faces, seen)
-            footprints = footprints_of(seen, points_and_normals[0].shape)
-            group = blockers.around_plane(*points_and_normals, footprints, body)
+            probes_of_body = points_of_fragments(positions, normals, merged_scene.faces, seen, footprint_inputs)
+            group = blockers.around_plane(*probes_of_body, body)
             portions = [share_of_sharpest_light(portion) for portion in group.portions()]
             known = [portion for portion in portions if portion is not None]
             if known:

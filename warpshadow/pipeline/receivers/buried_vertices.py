@@ -55,7 +55,7 @@ def find_bodies_with_buried_vertices(
             if mesh is None or normals is None:
                 on_device = wp.array(positions, dtype=wp.vec3, device=merged_scene.device)
                 mesh = merged_scene.casting_mesh(on_device)
-                normals = vertex_normals(on_device.reshape((1, -1)), merged_scene.faces).numpy()[0]
+                normals = vertex_normals(on_device.reshape((1, -1)), merged_scene.one_rings).numpy()[0]
             is_buried = np.zeros(len(positions), bool)
             is_buried[candidates] = find_buried(mesh, positions[candidates], normals[candidates])
             result[number] = (is_buried[corners].any(axis=1) & ~is_buried[corners].all(axis=1)).any()

@@ -16,6 +16,7 @@ from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receiver_footprints import FootprintInputs
 
 if TYPE_CHECKING:
     from warpshadow.pipeline.receivers.static import StaticBodies
@@ -50,8 +51,7 @@ class AdaptiveSurfaces(NamedTuple):
     spheres: tuple[wp.array, wp.array]  # centers and radii of all spheres
     is_adaptive: np.ndarray  # flat bodies whose samples interpolate, bool of shape [body]
     supersampling: int  # samples of a pixel across and down
-    # footprints of receivers at samples, given the fragments that these see, and the shape of all receivers
-    footprints_of: Callable[[Fragments, tuple[int, int]], wp.array]
+    footprint_inputs: FootprintInputs
 
 
 class ReceiverCount(NamedTuple):
@@ -108,7 +108,7 @@ class ShadingContext:
         self.materials, self.merged_scene = materials, merged_scene
         self.vertices, self.spheres, self.receivers_node = vertices, spheres, receivers
         self.call, self.static_bodies = call, static_bodies
-        self.normals = Node("", vertex_normals, vertices, merged_scene.faces) if normals is None else normals
+        self.normals = Node("", vertex_normals, vertices, merged_scene.one_rings) if normals is None else normals
         self._cached: dict[str, tuple[Hashable, Any]] = {}
         self._cached_of_bodies: dict[str, tuple[Hashable, Any]] = {}
         if neighbors is not None:

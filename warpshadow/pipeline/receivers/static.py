@@ -57,7 +57,7 @@ class StaticBodies:
                 "name all that do"
             )
         self._vertex_runs = merged_scene.runs(merged_scene.first_vertex, self.moving)
-        self.normals = Node("", vertex_normals, self._geometry.positions, merged_scene.faces)
+        self.normals = Node("", vertex_normals, self._geometry.positions, merged_scene.one_rings)
         self._clip_positions: Node | None = None
         self._gathered: tuple = (None,)  # vertices, and points and normals of them
         self._rows: dict[Hashable, VertexRows] = {}
@@ -91,8 +91,8 @@ class StaticBodies:
 
     def with_moving_normals(self, positions: wp.array, cached: wp.array) -> wp.array:
         """Overwrite the normals of moving vertices. Differentiable: positions."""
-        faces_of = self._merged_scene.faces_of
-        return splice(cached, self._vertex_runs, lambda a, b: vertex_normals(positions[:, a:b], faces_of(a, b)))
+        rings_of = self._merged_scene.rings_of
+        return splice(cached, self._vertex_runs, lambda a, b: vertex_normals(positions[:, a:b], rings_of(a, b)))
 
     def receivers(self, vertices: np.ndarray, normals: wp.array) -> tuple[wp.array, wp.array]:
         """Gather points and normals of some vertices: vec3 of shape [1, receiver].

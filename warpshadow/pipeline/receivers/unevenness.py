@@ -62,7 +62,7 @@ def light_unevenness(
         return result
     vertices = wp.array(positions, dtype=wp.vec3, device=device)
     mesh = merged_scene.casting_mesh(vertices)
-    normals = vertex_normals(vertices.reshape((1, -1)), merged_scene.faces).numpy()[0]
+    normals = vertex_normals(vertices.reshape((1, -1)), merged_scene.one_rings).numpy()[0]
     faces = merged_scene.faces.numpy()
     origins, corners = inset_vertices(positions, faces), faces[seen[rows]]
     points, point_normals = (_with_middles(values[corners]) for values in (origins, normals))

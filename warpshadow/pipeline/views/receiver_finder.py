@@ -5,8 +5,9 @@ import functools
 import numpy as np
 import warp as wp
 
-from warpshadow.device.constants import gather_of_owners
+from warpshadow.device.constants import constant, gather_of_owners
 from warpshadow.device.cuda_graph import is_readable
+from warpshadow.device.launch import without_gradient
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
 from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
@@ -14,7 +15,7 @@ from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.image.slopes import find_mean_slopes
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
-from warpshadow.stages.receivers.receiver_footprints import find_receiver_footprints
+from warpshadow.stages.receivers.receiver_footprints import FootprintInputs
 from warpshadow.stages.receivers.sample_receivers import MAX_SHARED_SAMPLES
 from warpshadow.stages.silhouettes.find import Silhouettes
 
@@ -71,7 +72,9 @@ class ReceiverFinder:
         method, merged_scene, scene_receivers = self._method, self._merged_scene, self._scene_receivers
         quadtree, has_mean_slope = None, None
         size = fragments.face_ids.shape[1] // self._supersampling, fragments.face_ids.shape[2] // self._supersampling
-        footprints_of = functools.partial(self._find_footprints, positions, clip_positions, size)
+        widths = constant(self._footprint_widths, wp.float32, merged_scene.device)
+        pixel = wp.vec2(2.0 / size[1], 2.0 / size[0])
+        footprint_inputs = FootprintInputs(without_gradient(clip_positions), widths, pixel)
         has_backs, at_samples = fragments.sides is not None, scene_receivers.at_samples(self._blocker_kinds)
         if not is_readable(merged_scene.device):
             numbering = scene_receivers.number_all(self._blocker_kinds, has_backs, self._static_bodies)
@@ -82,7 +85,7 @@ class ReceiverFinder:
             numbering = self._number_seen(seen_vertices(fragments, silhouettes, positions.shape[1]), has_cached_rows)
             if spheres is not None and (is_adaptive := scene_receivers.is_adaptive & at_samples).any():
                 surfaces = AdaptiveSurfaces(
-                    positions, normals, fragments, spheres, is_adaptive, self._supersampling, footprints_of
+                    positions, normals, fragments, spheres, is_adaptive, self._supersampling, footprint_inputs
                 )
                 quadtree = method.find_squares(self._blocker_kinds, surfaces)
         if at_samples.any() and fragments.barycentrics.requires_grad:
@@ -91,7 +94,8 @@ class ReceiverFinder:
             self._may_share_surfaces and min(fragments.face_ids.shape[1:]) >= _MIN_SHARED_SIZE * self._supersampling
         )
         body_of_face, separate = merged_scene.body_of_face, self._separate_bodies
-        receivers = find_receivers(
+        widens = method.edges_as_wide_as_footprints and self._footprint_widths.any()
+        return find_receivers(
             positions,
             normals,
             merged_scene.faces,
@@ -105,23 +109,8 @@ class ReceiverFinder:
             smooth_pieces=merged_scene.smooth_pieces if shares_surfaces else None,
             has_mean_slope=has_mean_slope,
             shares_receivers=None if method.shares_lobes else gather_of_owners(~merged_scene.is_glossy, body_of_face),
+            footprint_inputs=footprint_inputs if widens else None,
         )
-        widens = method.edges_as_wide_as_footprints
-        if receivers.sample_fragments is None or not (widens and self._footprint_widths.any()):
-            return receivers
-        return receivers._replace(footprints=footprints_of(receivers.sample_fragments, receivers.points.shape))
-
-    def _find_footprints(
-        self,
-        positions: wp.array,
-        clip_positions: wp.array,
-        size: tuple[int, int],
-        seen: Fragments,
-        shape: tuple[int, int],
-    ) -> wp.array:
-        """Find the footprints of receivers at samples, given the fragments that these see."""
-        arguments = positions, clip_positions, size, shape
-        return find_receiver_footprints(seen, self._merged_scene.faces, self._footprint_widths, *arguments)
 
     @functools.cached_property
     def _footprint_widths(self) -> np.ndarray:

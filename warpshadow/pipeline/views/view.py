@@ -115,7 +115,7 @@ class View(ShadingContext):
             "silhouettes", find_silhouettes, sides, faces, *edge_inputs, items=samples, has_adjoint=False
         )
         if static_bodies is None:
-            normals = Node("normals", vertex_normals, vertices, faces, items=corners)
+            normals = Node("normals", vertex_normals, vertices, merged_scene.one_rings, items=corners)
         else:
             normals = Node("normals", static_bodies.with_moving_normals, vertices, static_bodies.normals, items=corners)
         # gradients of receivers: at vertices to the vertices alone, at samples to the fragments, too

@@ -18,7 +18,6 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, expand_rows, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch_with_adjoint
-from warpshadow.device.memory import empty, zeros
 from warpshadow.maths.directions import cell_radius
 from warpshadow.stages.bounces.plane_hits import (
     PlaneHit,
@@ -29,6 +28,7 @@ from warpshadow.stages.bounces.plane_hits import (
     mean_radiosity,
 )
 from warpshadow.stages.cell_coverage import ViewedEdge
+from warpshadow.stages.light.sums import begin_sum
 from warpshadow.stages.planes.cells import check_planes, plane_arrays
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers
 from warpshadow.stages.planes.sides import (
@@ -62,7 +62,7 @@ def _light_receivers(
     # out
     light: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver."""
+    """A thread owns a receiver, and adds to its light."""
     receiver = prepare_receiver(first_row + wp.tid(), worker, inputs, sides, edges)
     batch, index = receiver.batch, receiver.index
     hits_of_cell = hits[receiver.slot]
@@ -78,7 +78,7 @@ def _light_receivers(
         if find_side_hits(inputs.planes, cell, texel_radiosity, weight, before, receiver, hits_of_cell) > 0:
             mean, _, total_coverage = mean_radiosity(receiver.side_count, hits_of_cell)
             total += (weight * wp.min(total_coverage, 1.0)) * mean
-    light[receiver.batch, receiver.index] = (4.0 / float(directions.shape[0])) * total
+    light[batch, index] = light[batch, index] + (4.0 / float(directions.shape[0])) * total
 
 
 @wp.kernel(enable_backward=False)
@@ -104,6 +104,7 @@ def _light_receivers_adjoint(
     adj_transmittance: wp.array3d(dtype=wp.float32),
     adj_coverages: wp.array3d(dtype=wp.vec4),
     adj_front_weights: wp.array3d(dtype=wp.float32),
+    adj_addend: wp.array2d(dtype=wp.vec3),
     # sums
     adj_frames: wp.array2d(dtype=wp.vec3),
     adj_texels: wp.array2d(dtype=wp.vec3),
@@ -162,6 +163,8 @@ def _light_receivers_adjoint(
                     adj_coverages[batch, index, q] = adj_coverages[batch, index, q] + adj_before
     if adj_normals:
         adj_normals[batch, index] = adj_normals[batch, index] + adj_normal
+    if adj_addend:
+        adj_addend[batch, index] = adj_addend[batch, index] + adj_light[batch, index]
     prepare_receiver_adjoint(receiver, inputs, adj_points, adj_front_weights, adj_frames)
 
 
@@ -177,8 +180,9 @@ def plane_light(
     coverages: wp.array | None = None,
     front_weights: wp.array | None = None,
     skip: int | None = None,
+    addend: wp.array | None = None,
 ) -> wp.array:
-    """Light that planes send to receivers.
+    """Light that planes send to receivers, added to other light.
 
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
@@ -193,17 +197,21 @@ def plane_light(
         front_weights: Part of the front of each plane that receivers see, float32 of shape [batch, receiver,
             plane], from :func:`warpshadow.stages.planes.fronts.find_fronts`; by default their heights decide.
         skip: Number of the plane that the receivers are part of, which sends them nothing; None for none.
+        addend: The other light, vec3 of shape [batch, receiver]; None for 0.
     Returns:
         Light that white receivers reflect of it, vec3 of shape [batch, receiver].
-    Differentiable: points, normals, transmittance, frames, texels, coverages, front_weights.
+    Differentiable: points, normals, transmittance, frames, texels, coverages, front_weights, addend.
     """
     check_planes(planes, points, frames, directions, skip)
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
     check.shape("transmittance", transmittance.shape, ("batch", points.shape[1], len(directions)))
     arguments = {"points": points, "normals": normals, "transmittance": transmittance, "coverages": coverages}
-    batch_count = common_batch({**arguments, "frames": frames, "texels": texels, "front_weights": front_weights})
+    arguments |= {"frames": frames, "texels": texels, "front_weights": front_weights, "addend": addend}
+    batch_count = common_batch(arguments)
+    addend = None if addend is None else expand(addend, batch_count)
+    light = begin_sum(addend, (batch_count, points.shape[1]), points.device)
     if planes.count == (skip is not None):
-        return zeros((batch_count, points.shape[1]), wp.vec3, points.device)
+        return light if addend is None else addend
     points, normals = (expand(array, batch_count) for array in (points, normals))
     transmittance = expand_rows(transmittance, batch_count)
     coverages, front_weights = (
@@ -218,8 +226,8 @@ def plane_light(
         _light_receivers_adjoint,
         points.size,
         inputs=inputs,
-        result=empty(points.shape, dtype=wp.vec3, device=points.device),
-        variables=[points, normals, transmittance, coverages, front_weights],
+        result=light,
+        variables=[points, normals, transmittance, coverages, front_weights, addend],
         shared=[frames, texels],
         scratch=[*receiver_scratch(planes), hit_scratch(planes)],
         adj_scratch=[hit_scratch(planes)],

@@ -11,54 +11,119 @@ Without v the foot of a thick wall in the sun was 2.5% too dark.
 
 import warp as wp
 
-from warpshadow.device.batch import instance_in
-from warpshadow.device.launch import launch
+from warpshadow.device.batch import common_batch, expand
+from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
+from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers
-from warpshadow.stages.sparse import multiply
+
+_ENTRY_COST = 4.0  # nanoseconds that a patch of a texel takes
+_RUN = 32  # texels or patches that a thread owns on a CPU
 
 
-@wp.kernel
-def _divide(
+@wp.kernel(enable_backward=False)
+def _find_texels(
+    first_row: int,
+    worker: int,
     # in
-    radiosity_sums: wp.array2d(dtype=wp.vec3),
-    weight_sums: wp.array2d(dtype=wp.vec3),
+    starts: wp.array(dtype=wp.int32),
+    patches: wp.array(dtype=wp.int32),
+    shares: wp.array(dtype=wp.float32),
+    radiosity: wp.array2d(dtype=wp.vec3),
+    patch_weights: wp.array2d(dtype=wp.vec3),
+    run: int,
     # out
+    weight_sums: wp.array2d(dtype=wp.float32),
     texels: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a texel of an instance; one far off the mesh is black."""
-    batch, texel = wp.tid()
-    weight = weight_sums[instance_in(batch, weight_sums.shape[0]), texel][0]
-    mean_radiosity = wp.vec3()
-    if weight > 0.0:
-        mean_radiosity = radiosity_sums[batch, texel] / weight
-    texels[batch, texel] = mean_radiosity
+    """A thread owns a run of texels of an instance; one far off the mesh is black."""
+    batch, thread = split_row(first_row + wp.tid(), (texels.shape[1] + run - 1) // run)
+    for texel in range(thread * run, wp.min((thread + 1) * run, texels.shape[1])):
+        weight_sum = float(0.0)
+        radiosity_sum = wp.vec3()
+        for entry in range(starts[texel], starts[texel + 1]):
+            weight = shares[entry] * patch_weights[batch, patches[entry]][0]
+            weight_sum += weight
+            radiosity_sum += weight * radiosity[batch, patches[entry]]
+        weight_sums[batch, texel] = weight_sum
+        texels[batch, texel] = wp.where(weight_sum > 0.0, radiosity_sum / weight_sum, wp.vec3())
 
 
-def sum_weights(patch_weights: wp.array, planes: PlaneBlockers) -> wp.array:
-    """Sum up the weights of the patches of each texel: Σ k v, vec3 of shape [batch, texel]. Differentiable in them."""
-    assert planes.texels_of_patches is not None
-    return multiply(planes.texels_of_patches, patch_weights)
+@wp.kernel(enable_backward=False)
+def _find_texels_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    starts: wp.array(dtype=wp.int32),
+    texel_indices: wp.array(dtype=wp.int32),
+    shares: wp.array(dtype=wp.float32),
+    radiosity: wp.array2d(dtype=wp.vec3),
+    patch_weights: wp.array2d(dtype=wp.vec3),
+    weight_sums: wp.array2d(dtype=wp.float32),
+    texels: wp.array2d(dtype=wp.vec3),
+    adj_texels: wp.array2d(dtype=wp.vec3),
+    run: int,
+    # out
+    adj_radiosity: wp.array2d(dtype=wp.vec3),
+    adj_patch_weights: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a run of patches of an instance.
+
+    With V_t = Σ_p k_tp v_p:  B̄_p += v_p Σ_t k_tp B̄_t / V_t,  v̄_p += Σ_t k_tp B̄_t · (B_p − B_t) / V_t
+    """
+    batch, thread = split_row(first_row + wp.tid(), (radiosity.shape[1] + run - 1) // run)
+    for patch in range(thread * run, wp.min((thread + 1) * run, radiosity.shape[1])):
+        adj_sum = wp.vec3()
+        adj_weight = float(0.0)
+        for entry in range(starts[patch], starts[patch + 1]):
+            texel = texel_indices[entry]
+            if weight_sums[batch, texel] > 0.0:
+                adj = (shares[entry] / weight_sums[batch, texel]) * adj_texels[batch, texel]
+                adj_sum += adj
+                adj_weight += wp.dot(adj, radiosity[batch, patch] - texels[batch, texel])
+        if adj_radiosity:
+            adj_patch = patch_weights[batch, patch][0] * adj_sum
+            adj_radiosity[batch, patch] = adj_radiosity[batch, patch] + adj_patch
+        if adj_patch_weights:
+            adj_patch_weights[batch, patch] = adj_patch_weights[batch, patch] + wp.vec3(adj_weight, 0.0, 0.0)
 
 
-def find_texels(
-    radiosity: wp.array, patch_weights: wp.array, planes: PlaneBlockers, weight_sums: wp.array | None = None
-) -> wp.array:
+def find_texels(radiosity: wp.array, patch_weights: wp.array, planes: PlaneBlockers) -> wp.array:
     """Find the radiosity of texels in all mip levels of planes.
 
     Args:
         radiosity: Of the patches of all bodies, vec3 of shape [batch, patch].
         patch_weights: v of each patch, in three equal channels, vec3 of shape [batch, patch]. Either batch may be 1.
         planes: The planes.
-        weight_sums: From :func:`sum_weights`, where they are found already.
     Returns:
         vec3 of shape [batch, texel].
-    Differentiable: radiosity, patch_weights, weight_sums.
+    Differentiable: radiosity, patch_weights (by the first channel).
     """
-    assert planes.texels_of_patches is not None
-    radiosity_sums = multiply(planes.texels_of_patches, radiosity, column_scales=patch_weights)
-    if weight_sums is None:
-        weight_sums = sum_weights(patch_weights, planes)
-    texels = empty(radiosity_sums.shape, dtype=wp.vec3, device=radiosity.device)
-    launch(_divide, radiosity_sums.shape, inputs=[radiosity_sums, weight_sums], outputs=[texels])
-    return texels
+    matrix, device = planes.texels_of_patches, radiosity.device
+    assert matrix is not None
+    (texel_count, patch_count), run = matrix.shape, run_length(device, _RUN)
+    count = common_batch({"radiosity": radiosity, "patch_weights": patch_weights})
+    radiosity, patch_weights = (expand(array, count) for array in (radiosity, patch_weights))
+    weight_sums = empty((count, texel_count), dtype=wp.float32, device=device)
+    texels = empty((count, texel_count), dtype=wp.vec3, device=device)
+    cost, inputs = _ENTRY_COST * matrix.rows.columns.size, [radiosity, patch_weights]
+
+    def forward(texels: wp.array) -> None:
+        launch(
+            _find_texels,
+            count * -(-texel_count // run),
+            inputs=[*matrix.rows, *inputs, run],
+            outputs=[weight_sums, texels],
+            cost=cost * run / max(texel_count, 1),
+        )
+
+    def adjoint(adj_texels: wp.array) -> None:
+        launch(
+            _find_texels_adjoint,
+            count * -(-patch_count // run),
+            inputs=[*matrix.columns, *inputs, weight_sums, texels, adj_texels, run],
+            outputs=[radiosity.grad, patch_weights.grad],
+            cost=cost * run / max(patch_count, 1),
+        )
+
+    return differentiable(forward, adjoint, texels, [radiosity, patch_weights])

@@ -21,14 +21,15 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.batch import common_batch, instance_in
+from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, span_count, vectors_type
 from warpshadow.device.launch import launch_with_adjoint, varies
-from warpshadow.device.memory import empty, zeros
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.bounces.proxy_weights import WeightInputs, make_weight_functions
 from warpshadow.stages.bounces.tangent_planes import TangentPlanes
+from warpshadow.stages.light.sums import begin_sum
 from warpshadow.stages.visibility.cones import TINY_RADIUS
 from warpshadow.stages.visibility.culling import (
     DirectionCells,
@@ -343,6 +344,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         adj_points: wp.array2d(dtype=wp.vec3),
         adj_normals: wp.array2d(dtype=wp.vec3),
         adj_transmittance: wp.array3d(dtype=wp.float32),
+        adj_addend: wp.array2d(dtype=wp.vec3),
         # out, or a sum where one instance serves all
         adj_transmittance_others: wp.array3d(dtype=wp.float32),
         # sums
@@ -383,6 +385,8 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
             add_vectors(adj_receivers.points, block, adj_points[batch])
         if adj_normals:
             add_vectors(adj_normal, block, adj_normals[batch])
+        if adj_addend and span == 0:
+            add_vectors(task.adj_light, block, adj_addend[batch])
 
     return add_light_adjoint
 
@@ -402,8 +406,9 @@ def sphere_light(
     skip: tuple[int, int] = (0, 0),
     clusters: ClusterTree | None = None,
     tangent_planes: TangentPlanes | None = None,
+    addend: wp.array | None = None,
 ) -> wp.array:
-    """Light that proxies send to receivers, through the cells that they block.
+    """Light that proxies send to receivers, through the cells that they block, added to other light.
 
     Args:
         points, normals, centers, radii: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
@@ -417,13 +422,14 @@ def sphere_light(
         softness, merging, skip, clusters: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
         tangent_planes: Of the proxies, which show nothing below them. A batch of 1 serves every instance. None for
             proxies that are seen from everywhere.
+        addend: The other light, vec3 of shape [batch, receiver]; a batch of 1 serves every instance. None for 0.
     Returns:
         Light that a white receiver reflects of it, vec3 of shape [batch, receiver]: 1 where all patches are white and
         radiant by 1.
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii of receivers and spheres, as the transmittance.
     Differentiable: points, normals, centers, radii, proxy_radiance, transmittance, transmittance_others, equations of
-    the tangent planes. (The derivative in T is the one at a fixed blend of proxies.) Not: directions, softness,
+    the tangent planes, addend. (The derivative in T is the one at a fixed blend of proxies.) Not: directions, softness,
     merging, skip, clusters, tolerances.
     """
     cells = make_cells(directions, softness, points.device)
@@ -449,7 +455,8 @@ def sphere_light(
     device, lanes, spans = points.device, traversal.lanes, span_count(points.device, len(directions))
     span_direction_count = len(directions) // spans
     is_shared = transmittance_others is not None and len(transmittance_others) < len(points)
-    variables = [points, normals, transmittance, *([] if is_shared else [transmittance_others])]
+    addend = None if addend is None else expand(addend, len(points))
+    variables = [points, normals, transmittance, addend, *([] if is_shared else [transmittance_others])]
     shared = [*([transmittance_others] if is_shared else []), proxy_radiance, equations, *traversal.nodes]
     stores_sums = varies([*variables, *shared])
     scratch = [
@@ -470,7 +477,7 @@ def sphere_light(
         lambda: _make_light_adjoint(lanes),
         run_dimensions(device, traversal.row_count, spans),
         inputs=[inputs],
-        result=zeros(points.shape, dtype=wp.vec3, device=device),
+        result=begin_sum(addend, points.shape, device),
         variables=variables,
         shared=shared,
         outputs=stored,

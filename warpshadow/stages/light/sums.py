@@ -4,7 +4,7 @@ import warp as wp
 
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty
+from warpshadow.device.memory import copied, empty, zeros
 
 
 @wp.kernel
@@ -25,6 +25,14 @@ def _add_light(
     if fourth:
         light += fourth[instance_in(batch, fourth.shape[0]), receiver]
     total[batch, receiver] = light
+
+
+def begin_sum(addend: wp.array | None, shape: tuple[int, int], device: wp.Device) -> wp.array:
+    """Light to which a kernel adds: a copy of other light, vec3 of shape [batch, receiver], or 0.
+
+    The kernel's adjoint has that of the copy.
+    """
+    return zeros(shape, wp.vec3, device) if addend is None else copied(addend)
 
 
 def add_light(*summands: wp.array) -> wp.array:

@@ -80,51 +80,48 @@ def _over_margin_adjoint(height: float, margin: float, adj_result: float):
     return
 
 
-@wp.kernel(enable_backward=False)
-def _find_extremes(
-    # in
-    corners: wp.array2d(dtype=wp.vec3),
-    first_corners: wp.array(dtype=wp.int32),
-    frames: wp.array2d(dtype=wp.vec3),
-    # out
-    extremes: wp.array3d(dtype=wp.vec2i),
-):
-    """A thread owns an instance, a body and a plane."""
-    batch, body, plane = wp.tid()
-    frame_batch = instance_in(batch, frames.shape[0])
-    plane_normal = wp.cross(frames[frame_batch, 3 * plane + 1], frames[frame_batch, 3 * plane + 2])
-    first = first_corners[body]
+@wp.func
+def _find_extremes(corners: wp.array(dtype=wp.vec3), first: int, end: int, axis: wp.vec3):
+    """The lowest and the highest of some corners along an axis; which these are has no gradient."""
     lowest_corner, highest_corner = int(first), int(first)
-    corner_batch = instance_in(batch, corners.shape[0])
-    first_corner = corners[corner_batch, first]
     minimum, maximum = float(0.0), float(0.0)
-    for corner in range(first + 1, first_corners[body + 1]):
-        height = wp.dot(corners[corner_batch, corner] - first_corner, plane_normal)
+    for corner in range(first + 1, end):
+        height = wp.dot(corners[corner] - corners[first], axis)
         if height < minimum:
             lowest_corner, minimum = corner, height
         if height > maximum:
             highest_corner, maximum = corner, height
-    extremes[batch, body, plane] = wp.vec2i(lowest_corner, highest_corner)
+    return wp.vec2i(lowest_corner, highest_corner)
+
+
+@wp.func_grad(_find_extremes)
+def _find_extremes_adjoint(
+    corners: wp.array(dtype=wp.vec3), first: int, end: int, axis: wp.vec3, adj_extremes: wp.vec2i
+):
+    return
 
 
 @wp.kernel
 def _find_body_sides(
     # in
     corners: wp.array2d(dtype=wp.vec3),
+    first_corners: wp.array(dtype=wp.int32),
     frames: wp.array2d(dtype=wp.vec3),
     grids: wp.array(dtype=PlaneGrid),
-    extremes: wp.array3d(dtype=wp.vec2i),
     # out
     body_sides: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns an instance, a body and a plane."""
     batch, body, plane = wp.tid()
     frame_batch = instance_in(batch, frames.shape[0])
+    axis_u = frames[frame_batch, 3 * plane + 1]
     side_of_body = float(0.0)
-    if wp.length_sq(frames[frame_batch, 3 * plane + 1]) > 0.0:
+    if wp.length_sq(axis_u) > 0.0:
         corner_batch = instance_in(batch, corners.shape[0])
-        min_height = _height(corners[corner_batch, extremes[batch, body, plane][0]], frames, frame_batch, plane)
-        max_height = _height(corners[corner_batch, extremes[batch, body, plane][1]], frames, frame_batch, plane)
+        plane_normal = wp.cross(axis_u, frames[frame_batch, 3 * plane + 2])
+        extremes = _find_extremes(corners[corner_batch], first_corners[body], first_corners[body + 1], plane_normal)
+        min_height = _height(corners[corner_batch, extremes[0]], frames, frame_batch, plane)
+        max_height = _height(corners[corner_batch, extremes[1]], frames, frame_batch, plane)
         side_of_body = wp.clamp(
             (max_height + min_height) / wp.max(max_height - min_height, grids[plane].margin), -1.0, 1.0
         )
@@ -144,11 +141,8 @@ def find_body_sides(corners: wp.array, first_corners: np.ndarray, frames: wp.arr
     """
     check.shape("frames", frames.shape, ("batch", 3 * planes.count))
     shape = common_batch({"corners": corners, "frames": frames}), len(first_corners) - 1, planes.count
-    extremes = empty(shape, dtype=wp.vec2i, device=corners.device)
-    starts = constant(first_corners, wp.int32, corners.device)
-    launch(_find_extremes, shape, inputs=[corners, starts, frames], outputs=[extremes])
     body_sides = empty(shape, dtype=wp.float32, device=corners.device)
-    inputs = [corners, frames, planes.grids, extremes]
+    inputs = [corners, constant(first_corners, wp.int32, corners.device), frames, planes.grids]
     launch(_find_body_sides, shape, inputs=inputs, outputs=[body_sides])
     return body_sides
 

@@ -12,18 +12,20 @@ import warp as wp
 
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import cached_by_values, constant
-from warpshadow.device.launch import launch
+from warpshadow.device.launch import launch, without_gradient
 from warpshadow.device.memory import empty, from_numpy, reshaped, zeros
-from warpshadow.device.parallel import run_length
+from warpshadow.device.parallel import find_run, run_dimensions, run_length
 from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.sides import split_side, split_sides
 from warpshadow.stages.receivers.quadtree import Quadtree
+from warpshadow.stages.receivers.receiver_footprints import FootprintInputs, find_pixel_area
 from warpshadow.stages.receivers.receiver_means import VisibleSurface
 from warpshadow.stages.receivers.sample_receivers import Span, find_sample_receivers, spans_of
 from warpshadow.stages.silhouettes.find import Silhouettes
 
-_MARK_COST = 5.0  # nanoseconds that a sample takes, to mark the corners of its face
+_MARK_COST, _GATHER_COST = 5.0, 40.0
+"""Nanoseconds that a sample takes, to mark the corners of its face, and a receiver."""
 
 
 class Receivers(NamedTuple):
@@ -88,6 +90,8 @@ def _rise_to_smooth_surface(
 
 @wp.kernel
 def _gather_points(
+    first_row: int,
+    worker: int,
     # in
     positions: wp.array2d(dtype=wp.vec3),
     normals: wp.array2d(dtype=wp.vec3),
@@ -96,14 +100,20 @@ def _gather_points(
     fragment_sides: wp.array2d(dtype=wp.int32),
     fragment_barycentrics: wp.array2d(dtype=wp.vec3),
     rises: bool,
+    clip_positions: wp.array2d(dtype=wp.vec4),
+    footprint_widths: wp.array(dtype=wp.float32),
+    pixel: wp.vec2,
     # out
     points: wp.array2d(dtype=wp.vec3),
     point_normals: wp.array2d(dtype=wp.vec3),
+    footprints: wp.array2d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver: a vertex, or a fragment, −1 for nothing."""
-    batch, receiver = wp.tid()
+    """A thread owns a receiver: a vertex, or a fragment, −1 for nothing. Footprints of vertices are 0."""
+    row, column = wp.tid()
+    batch, receiver = find_run(worker, first_row + row, column)
     position_batch = instance_in(batch, positions.shape[0])
     fragment = receiver - vertices.shape[0]
+    footprint = wp.vec3()
     if fragment < 0:
         vertex, is_back = split_side(vertices[receiver], positions.shape[1])
         points[batch, receiver] = positions[position_batch, vertex]
@@ -111,7 +121,8 @@ def _gather_points(
     else:
         fragment_batch = instance_in(batch, fragment_sides.shape[0])
         weights = fragment_barycentrics[fragment_batch, fragment]
-        face, is_back = split_side(wp.max(fragment_sides[fragment_batch, fragment], 0), faces.shape[0])
+        side = fragment_sides[fragment_batch, fragment]
+        face, is_back = split_side(wp.max(side, 0), faces.shape[0])
         point = interpolate_at(positions[position_batch], faces[face], weights)
         if rises:
             front, back = _rise_to_smooth_surface(
@@ -121,6 +132,14 @@ def _gather_points(
         points[batch, receiver] = point
         normal = wp.normalize(interpolate_at(normals[position_batch], faces[face], weights))
         point_normals[batch, receiver] = wp.where(is_back, -1.0, 1.0) * normal
+        if footprints:
+            width = footprint_widths[face]
+            if side >= 0 and width > 0.0:
+                clip = clip_positions[instance_in(batch, clip_positions.shape[0])]
+                area = find_pixel_area(positions[position_batch], clip, faces[face], weights, pixel)
+                footprint = width * width * area
+    if footprints:
+        footprints[batch, receiver] = footprint
 
 
 @wp.kernel(enable_backward=False)
@@ -233,6 +252,7 @@ def find_receivers(
     rises: bool = False,
     has_mean_slope: wp.array | None = None,
     shares_receivers: np.ndarray | None = None,
+    footprint_inputs: FootprintInputs | None = None,
 ) -> Receivers:
     """Gather the points at which light is evaluated.
 
@@ -253,6 +273,7 @@ def find_receivers(
         rises: Whether receivers of samples, from which rays leave, are lifted from their flat faces onto the curved
             surface that the vertex normals describe.
         has_mean_slope, shares_receivers: As for :func:`.sample_receivers.find_sample_receivers`.
+        footprint_inputs: By which those of samples have footprints; None where all are points.
     Returns:
         Receivers; where no face wants samples, many views of one geometry share them. While a graph is captured every
         sample has room for one.
@@ -272,7 +293,7 @@ def find_receivers(
         surface = None
         if smooth_pieces is not None and len(positions) == 1:
             visible_points = points_of_fragments(positions, normals, faces, Fragments(*receiver_fragments.rows))
-            surface = VisibleSurface(*visible_points, positions[0], faces, smooth_pieces)
+            surface = VisibleSurface(*visible_points[:2], positions[0], faces, smooth_pieces)
         arguments = receiver_fragments, side_count, wants_samples, body_keys, supersampling, quadtree, surface
         sample_receivers = find_sample_receivers(*arguments, has_mean_slope, shares_receivers)
         receiver_fragments, sample_fragments = sample_receivers.fragments, sample_receivers.sample_fragments
@@ -290,9 +311,19 @@ def find_receivers(
     if len(triangles):
         wp.copy(receiver_faces[count:], from_numpy(receiver_count + triangles, dtype=wp.vec3i, device=device))
     vertices = receiver_of_vertex if vertices is None else vertices
-    points = _gather_receiver_points(batch_count, positions, normals, faces, vertices, sample_fragments, rises=rises)
+    arguments = positions, normals, faces, vertices, sample_fragments
+    if bodies is None or sample_fragments is None or not sample_fragments.face_ids.size:
+        footprint_inputs = None
+    points, point_normals, footprints = _gather_receiver_points(batch_count, *arguments, footprint_inputs, rises=rises)
     receivers = Receivers(
-        *points, receiver_faces, receiver_of_vertex, receiver_fragments, static_vertices, has_mean_slope=has_mean_slope
+        points,
+        point_normals,
+        receiver_faces,
+        receiver_of_vertex,
+        receiver_fragments,
+        static_vertices,
+        has_mean_slope=has_mean_slope,
+        footprints=footprints,
     )
     if bodies is None:
         return receivers
@@ -308,18 +339,38 @@ def _gather_receiver_points(
     faces: wp.array,
     vertices: wp.array,
     sample_fragments: Fragments | None,
+    footprint_inputs: FootprintInputs | None = None,
     *,
     rises: bool = False,
-) -> tuple[wp.array, wp.array]:
-    """Points and normals of vertices and of fragments, for a number of instances. Differentiable: all but faces."""
+) -> tuple[wp.array, wp.array, wp.array | None]:
+    """Points and normals of vertices and of fragments, for a number of instances; and footprints, if there are inputs.
+
+    Differentiable: positions, normals, barycentrics. Not: footprints.
+    """
     device = positions.device
     if sample_fragments is None:
         sample_fragments = Fragments(*(empty((1, 0), dtype=dtype, device=device) for dtype in (wp.int32, wp.vec3)))
     shape = count, vertices.size + sample_fragments.face_ids.shape[1]
     points, point_normals = (empty(shape, dtype=wp.vec3, device=device) for _ in range(2))
-    inputs = [positions, normals, faces, vertices, sample_fragments.face_ids, sample_fragments.barycentrics, rises]
-    launch(_gather_points, shape, inputs=inputs, outputs=[points, point_normals])
-    return points, point_normals
+    footprints = None if footprint_inputs is None else empty(shape, dtype=wp.vec3, device=device)
+    launch(
+        _gather_points,
+        run_dimensions(device, shape[1], count),
+        cost=_GATHER_COST,
+        inputs=[
+            positions,
+            normals,
+            faces,
+            vertices,
+            sample_fragments.face_ids,
+            sample_fragments.barycentrics,
+            rises,
+            *(footprint_inputs or FootprintInputs()),
+        ],
+        outputs=[points, point_normals, footprints],
+        shared=[positions, normals],
+    )
+    return points, point_normals, None if footprints is None else without_gradient(footprints)
 
 
 def receivers_on_faces(
@@ -344,11 +395,12 @@ def receivers_on_faces(
     """
     device = positions.device
     sample_fragments = Fragments(constant(sides[None], wp.int32, device), constant(barycentrics[None], wp.vec3, device))
-    points = points_of_fragments(positions, normals, faces, sample_fragments)
+    points, point_normals, _ = points_of_fragments(positions, normals, faces, sample_fragments)
     no_vertices = constant(np.empty(0, int), wp.int32, device)
     spans = () if bodies is None else spans_of(bodies)
     return Receivers(
-        *points,
+        points,
+        point_normals,
         faces,
         no_vertices,
         sample_fragments,
@@ -359,15 +411,21 @@ def receivers_on_faces(
 
 
 def points_of_fragments(
-    positions: wp.array, normals: wp.array, faces: wp.array, fragments: Fragments
-) -> tuple[wp.array, wp.array]:
-    """Points and normals of fragments, sides and barycentrics [view, receiver]: vec3 of shape [batch, receiver].
+    positions: wp.array,
+    normals: wp.array,
+    faces: wp.array,
+    fragments: Fragments,
+    footprint_inputs: FootprintInputs | None = None,
+) -> tuple[wp.array, wp.array, wp.array | None]:
+    """Points, normals and, where there are inputs, footprints of fragments: vec3 of shape [batch, receiver].
 
-    Differentiable: positions, normals, barycentrics.
+    Args:
+        fragments: Sides and barycentrics [view, receiver].
+    Differentiable: positions, normals, barycentrics. Not: footprints.
     """
     count = common_batch({"positions": positions, "fragments": fragments.face_ids})
     no_vertices = constant(np.empty(0, int), wp.int32, positions.device)
-    return _gather_receiver_points(count, positions, normals, faces, no_vertices, fragments)
+    return _gather_receiver_points(count, positions, normals, faces, no_vertices, fragments, footprint_inputs)
 
 
 @wp.kernel(enable_backward=False)

@@ -27,8 +27,6 @@ rigid motion), and at edges far below a sample it would outweigh the rest, pulli
 
 import warp as wp
 
-from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty
 from warpshadow.stages.raster.screen import (
     direction_sign,
     face_plane,
@@ -36,7 +34,6 @@ from warpshadow.stages.raster.screen import (
     line_distance,
     line_slope,
     neighbor,
-    opposite,
     relative_to_ray_adjoint,
     sample_center,
 )
@@ -63,99 +60,60 @@ def _area_beyond(distance: float, slope: float):
     return area
 
 
-@wp.kernel(enable_backward=False)
-def _measure_areas(
-    # in
-    samples: wp.array(dtype=wp.int32),
-    edges: wp.array2d(dtype=wp.vec2i),
-    entries: wp.array(dtype=wp.int32),
-    fragments: FragmentArrays,
-    # out
-    shares: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a direction of an entry: area e beyond the line there, its weight ω, and the kind of its end."""
-    entry, direction = wp.tid()
-    edge = edges[entry, direction]
+@wp.func
+def measure_area(fragments: FragmentArrays, sample: int, direction: int, edge: wp.vec2i, neighbor_edge: wp.vec2i):
+    """Area e beyond the line in a direction, its weight ω, and whether a surface ends there, 1, or has a crease, 0.
+
+    At a crease the neighbor has the edge of another face. All are 0 where there is no line.
+    """
     area_and_weight = wp.vec3()
     if edge[0] != NOTHING:
         samples_per_unit = half_size(fragments.width, fragments.height)
-        line = line_between(fragments, samples[entry], direction, edge)
+        line = line_between(fragments, sample, direction, edge)
         distance = wp.clamp(line_distance(line, direction, samples_per_unit), 0.0, 1.0)
         slope = line_slope(line, direction, samples_per_unit)
         area = _area_beyond(distance, wp.min(slope, 1.0))
         if wp.isfinite(line / line[direction / 2]):  # else vertices are so far away that products overflow
-            neighbor_edge = edges[entries[neighbor(samples[entry], direction, fragments.width)], opposite(direction)]
             is_surface_end = edge[0] == neighbor_edge[0] and edge[1] == neighbor_edge[1]
             line_weight = 1.0 / (1.0 + slope * slope * slope * slope)
             area_and_weight = wp.vec3(area, line_weight, wp.where(is_surface_end, 1.0, 0.0))
-    shares[entry, direction] = area_and_weight
+    return area_and_weight
 
 
-@wp.kernel(enable_backward=False)
-def _measure_areas_adjoint(
-    # in
-    samples: wp.array(dtype=wp.int32),
-    edges: wp.array2d(dtype=wp.vec2i),
+@wp.func
+def measure_area_adjoint(
     fragments: FragmentArrays,
-    adj_areas: wp.array2d(dtype=wp.float32),
-    # out
+    sample: int,
+    direction: int,
+    edge: wp.vec2i,
+    adj_area: float,
     adj_clip_positions: wp.array2d(dtype=wp.vec4),
 ):
-    """A thread owns a direction of an entry: it adds to the gradients of the line's vertices."""
-    entry, direction = wp.tid()
-    edge = edges[entry, direction]
-    adj_area = adj_areas[entry, direction]
-    if edge[0] != NOTHING and adj_area != 0.0:
-        axis = direction / 2
-        sample = samples[entry]
-        batch = image_index(fragments, sample)
-        clip = fragments.clip_positions[batch]
-        samples_per_unit = half_size(fragments.width, fragments.height)
-        center = sample_center(sample, fragments.width, fragments.height)
-        line = line_between(fragments, sample, direction, edge)
-        distance = wp.clamp(line_distance(line, direction, samples_per_unit), 0.0, 1.0)
-        area_slope, _ = wp.grad(_area_beyond)(distance, wp.min(line_slope(line, direction, samples_per_unit), 1.0))
-        # of the line's x in a row, or its y in a column
-        adj_position = direction_sign(direction) * adj_area * area_slope * samples_per_unit[axis]
-        if edge[0] >= 0:
-            adj_a, adj_b = edge_position_adjoint(edge, center, axis, adj_position, clip)
-            wp.atomic_add(adj_clip_positions, batch, edge[0], adj_a)
-            wp.atomic_add(adj_clip_positions, batch, edge[1], adj_b)
-        else:
-            for end in range(2):
-                fragment = sample
-                sign = float(1.0)
-                if end == 1:
-                    fragment = neighbor(sample, direction, fragments.width)
-                    sign = -1.0
-                corners = fragments.faces[fragments.face_ids[fragment]]
-                ray = sample_center(fragment, fragments.width, fragments.height)
-                normal = face_plane(corners, ray, clip)
-                adj_clip = sign * adj_position * (normal[2] / line[axis]) * relative_to_ray_adjoint(ray, normal)
-                for k in range(3):
-                    wp.atomic_add(adj_clip_positions, batch, corners[k], fragments.barycentrics[fragment][k] * adj_clip)
-
-
-def measure_areas(samples: wp.array, edges: wp.array, entries: wp.array, arrays: FragmentArrays) -> wp.array:
-    """Measure the areas beyond the lines beside samples.
-
-    Args:
-        samples: Of each entry, int32 of shape [entry].
-        edges: Vertices of the line in each direction, vec2i of shape [entry, 4].
-        entries: Of each sample, int32 of shape [sample].
-        arrays: The fragments as kernels take them.
-    Returns:
-        The area e beyond each line, its weight ω, and whether a surface ends there, 1, or has a crease, 0;
-        vec3 of shape [entry, 4], zero where there is no line.
-    """
-    shares = empty(edges.shape, dtype=wp.vec3, device=edges.device)
-    launch(_measure_areas, edges.shape, inputs=[samples, edges, entries, arrays], outputs=[shares])
-    return shares
-
-
-def measure_areas_adjoint(samples: wp.array, edges: wp.array, arrays: FragmentArrays, adj_areas: wp.array) -> None:
-    """The adjoint of the areas e, float32 of shape [entry, 4]: add to the gradient of the clip positions."""
-    adj_clip_positions = arrays.clip_positions.grad
-    launch(
-        _measure_areas_adjoint, edges.shape, inputs=[samples, edges, arrays, adj_areas], outputs=[adj_clip_positions]
-    )
+    """The adjoint of `measure_area` by the area: it adds to the gradients of the line's vertices."""
+    axis = direction / 2
+    batch = image_index(fragments, sample)
+    clip = fragments.clip_positions[batch]
+    samples_per_unit = half_size(fragments.width, fragments.height)
+    center = sample_center(sample, fragments.width, fragments.height)
+    line = line_between(fragments, sample, direction, edge)
+    distance = wp.clamp(line_distance(line, direction, samples_per_unit), 0.0, 1.0)
+    area_slope, _ = wp.grad(_area_beyond)(distance, wp.min(line_slope(line, direction, samples_per_unit), 1.0))
+    # of the line's x in a row, or its y in a column
+    adj_position = direction_sign(direction) * adj_area * area_slope * samples_per_unit[axis]
+    if edge[0] >= 0:
+        adj_a, adj_b = edge_position_adjoint(edge, center, axis, adj_position, clip)
+        wp.atomic_add(adj_clip_positions, batch, edge[0], adj_a)
+        wp.atomic_add(adj_clip_positions, batch, edge[1], adj_b)
+    else:
+        for end in range(2):
+            fragment = sample
+            sign = float(1.0)
+            if end == 1:
+                fragment = neighbor(sample, direction, fragments.width)
+                sign = -1.0
+            corners = fragments.faces[fragments.face_ids[fragment]]
+            ray = sample_center(fragment, fragments.width, fragments.height)
+            normal = face_plane(corners, ray, clip)
+            adj_clip = sign * adj_position * (normal[2] / line[axis]) * relative_to_ray_adjoint(ray, normal)
+            for k in range(3):
+                wp.atomic_add(adj_clip_positions, batch, corners[k], fragments.barycentrics[fragment][k] * adj_clip)

@@ -24,7 +24,7 @@ from warpshadow.stages.raster.screen import (
     orientation,
     sample_center,
 )
-from warpshadow.stages.silhouettes.areas import measure_areas
+from warpshadow.stages.silhouettes.areas import measure_area
 from warpshadow.stages.silhouettes.edges import SNAP, edge_of_crossing, find_half_edge, is_crease, is_silhouette
 from warpshadow.stages.silhouettes.lines import (
     INTERSECTION,
@@ -265,6 +265,7 @@ def _make_entries(
     # out
     samples: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
+    shares: wp.array2d(dtype=wp.vec3),
     entries: wp.array(dtype=wp.int32),
 ):
     """A thread owns ``run`` samples after one another, whose entries begin where the run before ends.
@@ -284,18 +285,19 @@ def _make_entries(
             samples[entry] = wp.where(entry_number >= 0, sample, -1)
             for direction in range(4):
                 edge = wp.vec2i(NOTHING, NOTHING)
-                crossing_sample = wp.where(direction % 2 == 0, sample, neighbor(sample, direction, fragments.width))
+                neighbor_edge = wp.vec2i(NOTHING, NOTHING)
+                is_before = direction % 2 == 0  # crossings are of the sample before
+                crossing_sample = wp.where(is_before, sample, neighbor(sample, direction, fragments.width))
                 if entry_number >= 0 and crossing_sample >= 0:
+                    axis = direction / 2
                     edge = edge_of_crossing(
-                        fragments,
-                        neighbors,
-                        creases,
-                        crossings,
-                        crossing_sample,
-                        direction - direction % 2,
-                        direction % 2 == 1,
+                        fragments, neighbors, creases, crossings, crossing_sample, 2 * axis, not is_before
+                    )
+                    neighbor_edge = edge_of_crossing(
+                        fragments, neighbors, creases, crossings, crossing_sample, 2 * axis, is_before
                     )
                 edges[entry, direction] = edge
+                shares[entry, direction] = measure_area(fragments, sample, direction, edge, neighbor_edge)
             entries[sample] = wp.where(entry_number >= 0, entry, -1)
 
 
@@ -356,7 +358,8 @@ def find_silhouettes(
     if ends is not None:
         wp.utils.array_scan(ends, ends)
         entry_count = int(ends[-1:].numpy()[0]) if thread_count else 0
-    samples, edges = empty(entry_count, wp.int32, device), empty((entry_count, 4), wp.vec2i, device)
-    inputs = [crossings, arrays, neighbors, creases, ends, run]
-    launch(_make_entries, thread_count, cost=_ENTRY_COST * run, inputs=inputs, outputs=[samples, edges, entries])
-    return Silhouettes(samples, edges, measure_areas(samples, edges, entries, arrays), entries, fragments, faces)
+    samples = empty(entry_count, wp.int32, device)
+    edges, shares = (empty((entry_count, 4), dtype, device) for dtype in (wp.vec2i, wp.vec3))
+    inputs, outputs = [crossings, arrays, neighbors, creases, ends, run], [samples, edges, shares, entries]
+    launch(_make_entries, thread_count, cost=_ENTRY_COST * run, inputs=inputs, outputs=outputs)
+    return Silhouettes(samples, edges, shares, entries, fragments, faces)

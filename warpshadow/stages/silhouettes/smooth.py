@@ -20,13 +20,13 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import accumulate
 from warpshadow.device.launch import differentiable, launch
-from warpshadow.device.memory import copied, reshaped, zeros
+from warpshadow.device.memory import copied, reshaped
 from warpshadow.device.warp_internals import scalar_type
 from warpshadow.stages.raster.interpolation import inner_product
 from warpshadow.stages.raster.screen import neighbor, opposite
-from warpshadow.stages.silhouettes.areas import measure_areas_adjoint
+from warpshadow.stages.silhouettes.areas import measure_area_adjoint
 from warpshadow.stages.silhouettes.find import Silhouettes
-from warpshadow.stages.silhouettes.lines import INTERSECTION, make_fragment_arrays
+from warpshadow.stages.silhouettes.lines import INTERSECTION, FragmentArrays, make_fragment_arrays
 
 
 @wp.func
@@ -101,41 +101,44 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
         image: wp.array2d(dtype=dtype),
         samples: wp.array(dtype=wp.int32),
         shares: wp.array2d(dtype=wp.vec3),
-        width: int,
+        fragments: FragmentArrays,
         entries: wp.array(dtype=wp.int32),
         edges: wp.array2d(dtype=wp.vec2i),
         edge_colors: wp.array3d(dtype=dtype),
         adj_smoothed: wp.array2d(dtype=dtype),
         # out
         adj_image: wp.array2d(dtype=dtype),
-        adj_areas: wp.array2d(dtype=wp.float32),
+        adj_clip_positions: wp.array2d(dtype=wp.vec4),
     ):
-        """A thread owns an entry's sample of an image; ``adj_image`` already holds the part by the sample's own color.
+        """A thread owns an entry's sample of all images; ``adj_image`` already holds the part by its own color.
 
         Gradients of edges go by the contrast of the colors that both surfaces have there; without these, by the
         contrast of the samples.
         """
-        instance, entry = wp.tid()
+        entry = wp.tid()
         sample = samples[entry]
         if sample >= 0:
             sample_shares = shares[entry]
-            adj = adj_smoothed[instance, sample]
             for direction in range(4):
                 share = sample_shares[direction]
                 if share[0] > 0.0:
-                    other = neighbor(sample, direction, width)
+                    other = neighbor(sample, direction, fragments.width)
                     weight = _area_weight(sample_shares, direction)
-                    if adj_image:
-                        wp.atomic_add(adj_image, instance, other, share[0] * weight * adj)
-                        wp.atomic_sub(adj_image, instance, sample, share[0] * weight * adj)
-                    if adj_areas:
+                    adj_area = float(0.0)
+                    for instance in range(image.shape[0]):
+                        adj = adj_smoothed[instance, sample]
+                        if adj_image:
+                            wp.atomic_add(adj_image, instance, other, share[0] * weight * adj)
+                            wp.atomic_sub(adj_image, instance, sample, share[0] * weight * adj)
                         contrast = image[instance, other] - image[instance, sample]
                         if edge_colors:
                             neighbor_color = edge_colors[instance, entries[other], opposite(direction)]
                             contrast = neighbor_color - edge_colors[instance, entry, direction]
-                        adj_area = inner_product(adj, contrast)
-                        line_weight = wp.where(edges[entry, direction][0] == INTERSECTION, share[1], 1.0)
-                        wp.atomic_add(adj_areas, entry, direction, line_weight * adj_area)
+                        adj_area += inner_product(adj, contrast)
+                    if adj_clip_positions and adj_area != 0.0:
+                        edge = edges[entry, direction]
+                        adj_area *= wp.where(edge[0] == INTERSECTION, share[1], 1.0)
+                        measure_area_adjoint(fragments, sample, direction, edge, adj_area, adj_clip_positions)
 
     return blend_adjoint
 
@@ -170,26 +173,24 @@ def smooth_silhouettes(
     if scalar_type(image.dtype) is not wp.float32:
         raise ValueError(f"image: got dtype {image.dtype.__name__}, expected float32 or a vector of them")
     shape, samples, shares = silhouettes.flat_shape(image), silhouettes.samples, silhouettes.shares
-    dim, inputs = (shape[0], samples.size), [reshaped(image, shape), samples, shares, width]
 
     def blend(smoothed: wp.array) -> None:
-        launch(_make_blend(image.dtype), dim, inputs=inputs, outputs=[reshaped(smoothed, shape)])
+        inputs = [reshaped(image, shape), samples, shares, width]
+        outputs = [reshaped(smoothed, shape)]
+        launch(_make_blend(image.dtype), (shape[0], samples.size), inputs=inputs, outputs=outputs)
 
     def adjoint(adj_smoothed: wp.array) -> None:
-        adj_smoothed, adj_image, adj_areas = reshaped(adj_smoothed, shape), None, None
+        adj_smoothed, adj_image = reshaped(adj_smoothed, shape), None
         if image.requires_grad:
             adj_image = reshaped(image.grad, shape)
             accumulate(adj_smoothed, adj_image)
-        if clip_positions.requires_grad:
-            adj_areas = zeros(shares.shape, dtype=wp.float32, device=shares.device)
+        arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
+        edge_inputs = silhouettes.entries, silhouettes.edges, edge_colors
         launch(
             _make_blend_adjoint(image.dtype),
-            dim,
-            inputs=[*inputs, silhouettes.entries, silhouettes.edges, edge_colors, adj_smoothed],
-            outputs=[adj_image, adj_areas],
+            samples.size,
+            inputs=[reshaped(image, shape), samples, shares, arrays, *edge_inputs, adj_smoothed],
+            outputs=[adj_image, clip_positions.grad],
         )
-        if adj_areas is not None:
-            arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
-            measure_areas_adjoint(samples, silhouettes.edges, arrays, adj_areas)
 
     return differentiable(blend, adjoint, copied(image), [image, clip_positions])
