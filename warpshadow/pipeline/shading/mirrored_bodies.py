@@ -8,81 +8,114 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from warpshadow.device.batch import instance_of
+from warpshadow.device.batch import common_batch, instance_of
 from warpshadow.device.constants import constant
+from warpshadow.device.memory import empty
+from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node, detached, field_of
 from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
-from warpshadow.stages.gloss.lobe_hits import HIT_TYPES, LobeHits, trace_hits
-from warpshadow.stages.gloss.mirrored import mirror, mix_mirrored
+from warpshadow.pipeline.shading.light_input import LightInput
+from warpshadow.stages.gloss.lobe_hits import LobeHits, trace_hits
+from warpshadow.stages.gloss.mirrored import find_mirrors, mix_mirrored
 from warpshadow.stages.receivers.find import Receivers
 
 
-def find_mirrored_radiance(
-    points: ShadingContext,
-    materials: Materials,
-    samples: Node,
-    transmittance: Node,
-    mean_radiance: Node,
-    look_up: Callable[[Node, Node, Node], Node],
-) -> Node:
-    """Node of the radiance of blockers, vec3 of shape [batch, receiver, sample].
+class MirroredBodies:
+    """The bodies as rays from lobes meet them: a mesh whose hierarchy is refitted to each geometry.
 
     Args:
-        points: The receivers.
-        materials: Of the bodies.
-        samples: Node of their lobes' samples.
-        transmittance: Node of the samples' transmittance, 0 or 1.
-        mean_radiance: Node of the mean radiance of each receiver's blockers.
-        look_up: Makes the node of light without shadows, of nodes of directions, filters, and where these rays start.
+        merged_scene: The bodies.
     """
-    merged_scene, faces = points.merged_scene, points.merged_scene.faces
-    directions = field_of(samples, "directions")
-    find = functools.partial(_find_hits, merged_scene, _mirror_faces(merged_scene, materials))
-    traced = points.vertices, points.normals, points.receivers_node, directions, transmittance
-    items = functools.partial(receiver_text, points.weak)
-    hits = Node("hits of lobes", find, *(detached(source) for source in traced), items=items)
-    roughness, albedo, metallic = (materials.of_vertices(name) for name in ("roughness", "albedo", "metallic"))
-    mirrored = Node("", mirror, hits, faces, roughness, directions, field_of(samples, "filters"))
-    filters = field_of(mirrored, "filters")
-    light = look_up(field_of(mirrored, "directions"), filters, field_of(hits, "points"))
-    return Node("light of metals", mix_mirrored, hits, faces, albedo, metallic, filters, light, mean_radiance)
 
+    def __init__(self, merged_scene: MergedScene):
+        self._merged_scene = merged_scene
+        self._mesh: wp.Mesh | None = None
 
-def _mirror_faces(merged_scene: MergedScene, materials: Materials) -> wp.array:
-    """1 for faces of bodies that shine and have no textures, whose color and roughness vertices have."""
-    is_mirror = merged_scene.is_glossy.copy()
-    for textures in materials.textures_of.values():
-        is_mirror &= np.array([size is None for size in textures.sizes])
-    return constant(is_mirror[merged_scene.body_of_face].astype(np.int32), wp.int32, merged_scene.device)
+    def mirrors(self, materials: Materials) -> tuple[int, ...]:
+        """Bodies that lobes may meet as metals: they have no textures, and other bodies shine or they are not convex.
 
-
-def _find_hits(
-    merged_scene: MergedScene,
-    is_mirror: wp.array,
-    positions: wp.array,
-    vertex_normals: wp.array,
-    receivers: Receivers,
-    directions: wp.array,
-    transmittance: wp.array,
-) -> LobeHits:
-    """Trace all instances: arrays of shape [batch, receiver, sample]."""
-    hits = [
-        trace_hits(
-            merged_scene.mesh(instance_of(positions, instance)),
-            is_mirror,
-            merged_scene.faces,
-            instance_of(vertex_normals, instance),
-            instance_of(receivers.points, instance),
-            instance_of(receivers.normals, instance),
-            instance_of(directions, instance),
-            instance_of(transmittance, instance),
+        Args:
+            materials: Of the bodies.
+        """
+        bodies, is_glossy = self._merged_scene.scene.bodies, self._merged_scene.is_glossy
+        has_texture = np.any([[size is not None for size in of.sizes] for of in materials.textures_of.values()], axis=0)
+        return tuple(
+            number
+            for number in np.flatnonzero(is_glossy & ~has_texture).tolist()
+            if materials.may_be_metal(number) and (is_glossy.sum() > 1 or not bodies[number].mesh.is_convex)
         )
-        for instance in range(len(directions) if directions.size else 0)
-    ]
-    joined = [wp.empty(directions.shape, dtype=dtype, device=directions.device) for dtype in HIT_TYPES]
-    for array, parts in zip(joined, zip(*hits, strict=True), strict=False):
-        for instance, part in enumerate(parts):
-            wp.copy(array[instance], part)
-    return LobeHits(*joined)
+
+    def radiance(
+        self,
+        points: ShadingContext,
+        light: LightInput,
+        materials: Materials,
+        mirrors: tuple[int, ...],
+        samples: Node,
+        transmittance: Node,
+        mean_radiance: Node,
+        look_up: Callable[[Node, Node, Node], Node],
+    ) -> Node:
+        """Node of the radiance of blockers, vec3 of shape [batch, receiver, sample].
+
+        Args:
+            points: The receivers.
+            light: Known or free.
+            materials: Of the bodies.
+            mirrors: Of :meth:`mirrors`.
+            samples: Node of the lobes' samples, cached with the roughness.
+            transmittance: Node of the samples' transmittance.
+            mean_radiance: Node of the mean radiance of each receiver's blockers.
+            look_up: Makes the node of light without shadows, of nodes of directions, filters, and where rays start.
+        """
+        faces = self._merged_scene.faces
+        starts, directions = field_of(points.receivers_node, "points"), field_of(samples, "directions")
+
+        def trace() -> Node:
+            find = functools.partial(self._find_hits, mirrors)
+            traced = points.vertices, points.normals, points.receivers_node, directions, transmittance
+            items = functools.partial(receiver_text, points.weak)
+            return Node("hits of lobes", find, *map(detached, traced), items=items)
+
+        hits = points.cached("hits", (samples, light.visibility_key, mirrors), trace)
+        roughness, albedo, metallic = (materials.of_vertices(name) for name in ("roughness", "albedo", "metallic"))
+        of_vertices, of_samples = (
+            (points.vertices, points.normals, roughness),
+            (directions, field_of(samples, "filters")),
+        )
+        found = Node("", find_mirrors, hits, faces, *of_vertices, starts, *of_samples)
+        mirrored_light = look_up(*(field_of(found, name) for name in ("directions", "filters", "points")))
+        of_metals = found, albedo, metallic, mirrored_light
+        return Node("light of metals", mix_mirrored, hits, faces, *of_metals, mean_radiance)
+
+    def _find_hits(
+        self,
+        mirrors: tuple[int, ...],
+        positions: wp.array,
+        vertex_normals: wp.array,
+        receivers: Receivers,
+        directions: wp.array,
+        transmittance: wp.array,
+    ) -> LobeHits:
+        """Trace all instances: arrays of shape [batch, receiver, sample]."""
+        merged_scene, device = self._merged_scene, directions.device
+        is_mirror = constant(np.isin(merged_scene.body_of_face, mirrors).astype(np.int32), wp.int32, device)
+        batches = positions, vertex_normals, receivers.points, receivers.normals, directions, transmittance
+        shape = common_batch({str(number): batch for number, batch in enumerate(batches)}), *directions.shape[1:]
+        hits = LobeHits(*(empty(shape, dtype=dtype, device=device) for dtype in (wp.int32, wp.float32)))
+        for instance in range(shape[0] if directions.size else 0):
+            of_vertices, *of_receivers = (instance_of(batch, instance) for batch in batches)
+            mesh, of_instance = self._refitted(of_vertices), LobeHits(*(array[instance] for array in hits))
+            trace_hits(mesh, is_mirror, merged_scene.faces, *of_receivers, of_instance)
+        return hits
+
+    def _refitted(self, positions: wp.array) -> wp.Mesh:
+        """The mesh of all bodies, of vertices [vertex]; until the next one is asked for."""
+        if self._mesh is None:
+            self._mesh = self._merged_scene.mesh(positions)
+        with unrecorded():
+            wp.copy(self._mesh.points, positions)
+        self._mesh.refit()
+        return self._mesh
