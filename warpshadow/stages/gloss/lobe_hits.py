@@ -1,10 +1,11 @@
-"""Hits of lobes: which faces of metals their samples meet, and whether these see the sky they mirror."""
+"""Hits of lobes: which faces of bodies that shine their samples meet, and whether these see the sky they mirror."""
 
 from typing import NamedTuple
 
 import warp as wp
 
 from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.rays.ray_tracing import RAY_COST, escapes, first_hit
 
@@ -26,21 +27,25 @@ def _trace_hits(
     transmittance: wp.array2d(dtype=wp.float32),
     # out
     face_ids: wp.array2d(dtype=wp.int32),
+    barycentrics: wp.array2d(dtype=wp.vec3),
+    hit_normals: wp.array2d(dtype=wp.vec3),
     is_open: wp.array2d(dtype=wp.float32),
+    hit_points: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a sample."""
     row, sample = wp.tid()
     receiver = first_row + row
     direction = directions[receiver, sample]
     face = int(-1)
-    openness = float(0.0)
+    point = points[receiver]
     if transmittance[receiver, sample] < 1.0 and wp.dot(direction, normals[receiver]) > 0.0:
         hit = first_hit(mesh, points[receiver], normals[receiver], direction)
         face = hit.face
         if is_mirror[wp.max(face, 0)] == 0:
             face = -1
         if face >= 0:
-            normal = wp.normalize(interpolate_at(vertex_normals, faces[face], hit.weights))
+            corners = faces[face]
+            normal = wp.normalize(interpolate_at(vertex_normals, corners, hit.weights))
             if hit.is_back:
                 normal = -normal
             cosine = wp.dot(normal, direction)
@@ -49,17 +54,27 @@ def _trace_hits(
                 + hit.weights[1] * wp.mesh_get_point(mesh, 3 * face + 1)
                 + hit.weights[2] * wp.mesh_get_point(mesh, 3 * face + 2)
             )
-            if cosine < 0.0 and escapes(mesh, point, normal, direction - 2.0 * cosine * normal):
-                openness = 1.0
+            mirrored = direction - 2.0 * cosine * normal
+            barycentrics[receiver, sample] = hit.weights
+            hit_normals[receiver, sample] = normal
+            is_open[receiver, sample] = 0.0
+            if cosine < 0.0 and escapes(mesh, point, normal, mirrored):
+                is_open[receiver, sample] = 1.0
     face_ids[receiver, sample] = face
-    is_open[receiver, sample] = openness
+    hit_points[receiver, sample] = point
 
 
 class LobeHits(NamedTuple):
-    """Faces of metals that samples of lobes meet; arrays of shape [batch, receiver, sample]."""
+    """Points of bodies that shine, which samples of lobes meet; arrays of shape [receiver, sample]."""
 
-    face_ids: wp.array  # int32, −1 for a sample that meets none
+    face_ids: wp.array  # int32, −1 for a sample that meets no such body: it has no other number
+    barycentrics: wp.array  # vec3
+    normals: wp.array  # unit normals on the side that is met, vec3
     is_open: wp.array  # T', float32
+    points: wp.array  # vec3 [scene units]; the receiver of a sample that meets no such body
+
+
+HIT_TYPES = wp.int32, wp.vec3, wp.vec3, wp.float32, wp.vec3  # of the arrays of LobeHits
 
 
 def trace_hits(
@@ -71,21 +86,22 @@ def trace_hits(
     normals: wp.array,
     directions: wp.array,
     transmittance: wp.array,
-    hits: LobeHits,
-) -> None:
+) -> LobeHits:
     """Trace which faces the samples of lobes meet, of an instance, and whether these see the sky where they mirror it.
 
     Args:
         mesh: Of all bodies.
-        is_mirror: 1 for faces of metals, int32 of shape [face].
+        is_mirror: 1 for faces that shine, int32 of shape [face].
         faces: Vertices of the mesh, vec3i of shape [face].
         vertex_normals: Their unit normals, vec3 of shape [vertex].
         points, normals: Of the receivers, vec3 of shape [receiver].
         directions: Of the samples, vec3 of shape [receiver, sample].
         transmittance: Of the samples, float32 of shape [receiver, sample]; where it is 1 nothing is traced.
-        hits: Filled, arrays of shape [receiver, sample].
 
     Differentiable: no.
     """
+    shape, device = directions.shape, points.device
+    hits = LobeHits(*(empty(shape, dtype=dtype, device=device) for dtype in HIT_TYPES))
     inputs = [mesh.id, is_mirror, faces, vertex_normals, points, normals, directions, transmittance]
-    launch(_trace_hits, directions.shape, inputs=inputs, outputs=[*hits], cost=2 * RAY_COST * directions.shape[1])
+    launch(_trace_hits, shape, inputs=inputs, outputs=[*hits], cost=2 * RAY_COST * shape[1])
+    return hits
