@@ -75,7 +75,7 @@ class SceneRenderer:
             harmonics.
     Attributes:
         scene: The scene; receivers "auto" have been replaced by the chosen ones.
-        cameras: The cameras of the scene.
+        cameras: The cameras whose images it draws.
         has_camera_batch: Whether they were given as a batch.
         basis: Basis of free light.
         device: Device of its arrays.

@@ -147,8 +147,8 @@ class LightTransport:
             return None
         arguments = lobes.all_points, lobes.light, materials
         bounced, openness = self.shading_without_emitters(*arguments), self._openness(*arguments)
-        own_openness = None if openness is None else lobes.points.select(openness)
-        return self.method.lobes.blocked_radiance(lobes, lobes.points.select(bounced), own_openness)
+        selected_openness = None if openness is None else lobes.points.select(openness)
+        return self.method.lobes.blocked_radiance(lobes, lobes.points.select(bounced), selected_openness)
 
     def _openness(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node | None:
         """Part of the hemispheres of points that no blocker takes, vec3 of shape [view, receiver].

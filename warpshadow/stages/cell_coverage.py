@@ -15,7 +15,8 @@ term for each edge that crosses the disc, the area between the edge and the disc
 The angles together are that of the product of complex numbers d² + s₀ s₁ − i d (s₁ − s₀), and a turn each time that it
 crosses the negative axis: one arc tangent for a cell, not one for an edge, which takes 12 to 20% less time.
 
-Where in the cell the shape is, its first moment says, by Green's theorem, with n̂ the unit vector from the line to ω:
+Its first moment says where in the cell the shape is. By Green's theorem, with n̂ the unit vector across the line,
+towards the shape:
 
     π ρ³ μ = ∫ y dA = ⅓ Σ_edges (s₁ − s₀) ((ρ² − d²) n̂ + ½ d (s₀ + s₁) t)
 

@@ -225,7 +225,7 @@ def look_up_self_visibility(
     span: EmitterSpan,
     self_visibility: EmitterSelfVisibility,
     *,
-    is_own: bool = False,
+    is_on_emitter: bool = False,
 ) -> wp.array:
     """Transmittance of an emitter's own body between receivers and its samples.
 
@@ -234,7 +234,7 @@ def look_up_self_visibility(
         samples: Of all emitters.
         span: Those of the emitter.
         self_visibility: Its own.
-        is_own: Whether the receivers lie on the emitter.
+        is_on_emitter: Whether the receivers lie on the emitter.
     Returns:
         Float32 of shape [batch, receiver, sample].
     Differentiable: points, samples.
@@ -256,7 +256,7 @@ def look_up_self_visibility(
         count * points.shape[1],
         inputs=[
             *(points, sample_points, span.first, moments, nearest_rotations(moments), *table, *cells),
-            *(_REACH_COSINE, _REACH_ON_LAMP if is_own else 1.0),
+            *(_REACH_COSINE, _REACH_ON_LAMP if is_on_emitter else 1.0),
         ],
         outputs=[weighted_sums],
         shared=[points, sample_points, moments],

@@ -275,8 +275,8 @@ def transmittance(
     """Transmittance of spheres towards cells of directions.
 
     Args:
-        points: Receiver positions [scene units], vec3 of shape [batch, vertex].
-        normals: Unit normals, vec3 of shape [batch, vertex]: cells below a receiver's horizon, where the cosine is
+        points: Receiver positions [scene units], vec3 of shape [batch, receiver].
+        normals: Unit normals, vec3 of shape [batch, receiver]: cells below a receiver's horizon, where the cosine is
             zero, may be left at 1. None computes it all.
         centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
         radii: Sphere radii [scene units], float32 of shape [batch, sphere]; a radius of 0 blocks nothing.
@@ -287,10 +287,10 @@ def transmittance(
         skip: Spheres that are left out: the first, and the one after the last.
         clusters: Of these spheres, from :func:`.traversal.find_clusters`, where they are found already.
         footprints: Areas f² for which receivers stand, as vectors along the normals of their planes or against them
-            [scene units²], vec3 of shape [batch, vertex]: by their size as the directions see it, on average, the
+            [scene units²], vec3 of shape [batch, receiver]: by their size as the directions see it, on average, the
             falloff is wider; None where receivers are points.
     Returns:
-        Transmittance in [0, 1], float32 of shape [batch, vertex, direction].
+        Transmittance in [0, 1], float32 of shape [batch, receiver, direction].
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii. (That waits for the device. While a CUDA graph
             is captured, nothing is checked.)

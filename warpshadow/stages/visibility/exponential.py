@@ -374,13 +374,13 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
     then bounded, and draws a warning.
 
     Args:
-        log_sh: Log-visibility f, float32 of shape [batch, vertex, order²], f̂ being f without its constant part.
+        log_sh: Log-visibility f, float32 of shape [batch, receiver, order²], f̂ being f without its constant part.
         base: Approximation of exp*(h) for small h: "quadratic" 1 + h + h²/2, "linear" 1 + h, or "optimal_linear"
             a(|h|) 1 + b(|h|) h with a and b tabulated from caps of all angles.
         threshold: Largest |h|; None for the default of THRESHOLDS[base]. Beyond its limit squaring explodes, so more
             is refused.
     Returns:
-        SH visibility, float32 of shape [batch, vertex, order²].
+        SH visibility, float32 of shape [batch, receiver, order²].
     Raises:
         ValueError: for NaN, Inf and numbers beyond 1e18. (That waits for the device. While a CUDA graph is captured,
             nothing is checked.)
@@ -394,14 +394,14 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
             f"threshold: got {threshold!r} for base {base!r}, expected {MIN_THRESHOLD} to {limit}: beyond it "
             "repeated squaring is unstable, below it drowns in rounding"
         )
-    check.shape("log_sh", log_sh.shape, ("batch", "vertex", "order²"))
+    check.shape("log_sh", log_sh.shape, ("batch", "receiver", "order²"))
     order = int(round(np.sqrt(log_sh.shape[2])))
     sh.check_order(order)
-    check.shape("log_sh", log_sh.shape, ("batch", "vertex", order**2))
+    check.shape("log_sh", log_sh.shape, ("batch", "receiver", order**2))
     device = log_sh.device
     lanes = lane_count(device)
-    batch_count, vertex_count = log_sh.shape[:2]
-    blocks = block_count(vertex_count, lanes)
+    batch_count, receiver_count = log_sh.shape[:2]
+    blocks = block_count(receiver_count, lanes)
     row_count = batch_count * blocks
     scratch = [Scratch((4, order**2), lane_type(lanes))]
     # room for the most squarings; a CPU never touches the memory of squarings that are not done, a GPU reserves all
@@ -438,8 +438,8 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
             check.finite("log_sh", log_sh.numpy())
         if held_count:
             check.warn(
-                f"log-SH visibility of {held_count} of {batch_count * vertex_count} receivers is held back from rising "
-                "above 1, since many spheres overlap; fewer spheres, or directional transmittance, are accurate"
+                f"log-SH visibility of {held_count} of {batch_count * receiver_count} receivers is held back from "
+                "rising above 1, since many spheres overlap; fewer spheres, or directional transmittance, are accurate"
             )
 
     look_at_values(faults, judge)
