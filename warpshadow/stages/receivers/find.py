@@ -30,9 +30,11 @@ class Receivers(NamedTuple):
     """Receivers of every instance.
 
     The first receivers are vertices of static bodies: they have indices, but no points and normals here. The others are
-    vertex receivers, then sample receivers. ``faces`` has three receivers a row: rows of the mesh's faces, or sides; a
-    row (r, r, r) for each sample receiver r; the triangles in which samples interpolate. ``fragments`` name these rows
-    in place of the mesh's faces; a side of −1 is no receiver.
+    vertex receivers, then sample receivers.
+
+    ``faces`` has three receiver numbers a row: first a row for each face of the mesh (or each side); then a row
+    (r, r, r) for each sample receiver r; then the triangles between samples. A fragment's face number is a row of it,
+    −1 for none.
     """
 
     points: wp.array  # [batch, receiver − on static] vec3

@@ -95,11 +95,15 @@ def _find_owner_samples(
     weights: wp.array2d(dtype=wp.vec3),
     is_owner: wp.array2d(dtype=wp.bool),
 ):
-    """A thread owns a run of pixels of a row.
+    """A thread owns a run of pixels of a row: it finds where each sample has its light, and the weights there.
 
-    A sample gets the owner of its receiver, the first sample that shares it, −1 if its receivers are vertices, or
-    −2 − t in a triangle t; and the weights of its receivers. A corner of squares is at its sample, so others do not
-    share it.
+    | owner sample | light of the sample |
+    | --- | --- |
+    | ≥ 0 | of the receiver that this sample owns, the first of those that share it |
+    | −1 | interpolated between the vertices of the face |
+    | −2 − t | interpolated in triangle t |
+
+    A corner of squares is at its sample, so others do not share it.
     """
     view, thread = split_row(first_row + wp.tid(), sides.shape[1] // (supersampling * supersampling) // run)
     pixels = width // supersampling
