@@ -1,13 +1,13 @@
 """Patches: the parts of a body's surface that send light as one, and the patch samples at which they are lit.
 
 Faces are cut at their longest edges into pieces of about one size, and patches are clusters of pieces by position and
-normal (k-means): 256 at most, of 8 pieces or more. They are smaller where the body touches another
+normal (k-means): 256 at most, of 8 pieces or more, smaller where the body touches another
 (:mod:`warpshadow.maths.contacts`). A body that lies in a plane has a grid of texels instead, which are small near the
 other bodies, whose shadows it shows (:mod:`warpshadow.stages.planes.grid`). A patch has up to four patch samples, with
 weights by area. Pieces inside another part of the body belong to no patch.
 
-All is found once, in the body's own frame and at rest; patches move with the body. The patches of an open surface's
-backs follow those of its fronts.
+All is found once, in the body's own frame and at rest; patches move with the body. Patches of backs follow those of
+fronts.
 """
 
 from collections.abc import Callable, Sequence

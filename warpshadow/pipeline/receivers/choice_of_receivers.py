@@ -1,12 +1,11 @@
 """The choice of receivers, by the table of README.md beside this file.
 
-Flat bodies are adaptive (:mod:`.receivers.adaptive`) where shadows may have edges, and where arrays are readable, on a
-CPU: a ground has about the error that it has by pixel, in less time. Where a renderer has a basis, light is free, and
-nobody knows where edges will be.
+Flat bodies are adaptive (:mod:`.receivers.adaptive`) where shadows may have edges: of known light, and where arrays are
+readable, on a CPU. A ground then has about the error that it has by pixel, in less time.
 
 Between vertices light is interpolated, which shows where a face is large, or small and long, as spokes and rails are;
-so faces count by their pixels and by their longest edges. A picture that is made once can afford per-pixel receivers on
-its grounds and walls, where shadows' edges show most.
+so faces count by their pixels and by their longest edges. A still can afford receivers at the pixels of its grounds and
+walls, where shadows' edges show most.
 """
 
 import dataclasses

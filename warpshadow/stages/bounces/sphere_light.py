@@ -3,15 +3,14 @@
     I = 4/Q Σ_q max(n·ω_q, 0) (F_q − T_q) R_q
     R_q = Σ_j w_j a_jq L_jq / Σ_j w_j a_jq S_jq
 
-R is the mean radiosity of the proxies j that block cell q in part, blended without sorting [McGuire and Bavoil 2013,
-weighted blended order-independent transparency]. T_q is the transmittance past them, F_q that without them, so the
-light is all that a cell lacks. a_jq are the shares of the transmittance, T_q = F_q Π_j (1 − a_jq), w the weights of
-:mod:`.proxy_weights`, L and S the light and the area that proxies show (:mod:`.proxy_radiance`). R is smooth in
-everything, stays within the radiosities of the patches, and does not depend on the scene's units.
+The light is all that a cell lacks: T_q is the transmittance past the proxies j, F_q that without them. R is the mean
+radiosity of those that block the cell in part, blended without sorting [McGuire and Bavoil 2013, weighted blended
+order-independent transparency]: a_jq are the shares of the transmittance, T_q = F_q Π_j (1 − a_jq), w the weights of
+:mod:`.proxy_weights`, L and S the light and the area that proxies show (:mod:`.proxy_radiance`). R is smooth, within
+the radiosities of the patches, and independent of the scene's units.
 
-The traversal is that of the transmittance, with other visits. The adjoint needs both sums of R of the cells in which
-light is blocked; the forward launch stores them: 16 bytes a receiver and cell, touched only in bundles of cells that
-are blocked in part. N bounces store N times that.
+The traversal is that of the transmittance, with other visits. For the adjoint the forward launch stores both sums of R:
+16 bytes a receiver and cell, touched only in bundles of cells that are blocked in part; N bounces store N times that.
 """
 
 import functools

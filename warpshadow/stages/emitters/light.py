@@ -5,8 +5,8 @@
 L_k is the radiance of sample k, A_k its area vector, d_k and ω_k the distance and the direction to its middle, T_k the
 transmittance on the way past spheres, planes, convex parts, the receiver's own body and the emitter's. E is over π, as
 all shading is. The root is π d² but for receivers closer to a sample than samples are to each other, where nothing
-becomes infinite. (The form factor of a disc on its axis has π d² + |A| in place of the root; samples are beside each
-other.) An open body sends light to both sides: |A_k·ω_k| is in place of the maximum.
+becomes infinite. (A disc on its axis has π d² + |A| instead; samples are beside each other.) An open body sends light
+to both sides: |A_k·ω_k| is in place of the maximum.
 
 Receivers closer than about three times its half diagonal see a sample as its pieces, triangles whose
 form factors (:mod:`.triangles`) are in place of the fraction.

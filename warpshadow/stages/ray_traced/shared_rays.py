@@ -7,10 +7,10 @@ With directions ω_i and the light l_i that each stands for (:func:`.light_sampl
 Some receivers tell where light comes from, so that most directions go there (:func:`find_shares`).
 Rays go through the scene in packets of 16 that are close to each other (:mod:`.ray_packets`).
 
-Neighbors in an image mostly see the same light. So all rays of receivers at the corners of squares of pixels are traced
-(:func:`find_corners`). Receivers within a square take over the visibility on which its corners agree, interpolate the
-visibility of doubtful rays that bring little light, and trace the others. So edges of shadows are as sharp as if all
-were traced; but a shadow that falls between the corners is missed.
+Neighbors in an image mostly see the same light. So all rays are traced at the corners of squares of pixels alone
+(:func:`find_corners`). Receivers within a square take over the visibility on which its corners agree, interpolate that
+of doubtful rays that bring little light, and trace the others. Edges of shadows are as sharp as if all were traced, but
+a shadow that falls between the corners is missed.
 """
 
 import functools

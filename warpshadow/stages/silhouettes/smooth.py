@@ -7,10 +7,9 @@ the lines and weights ω_k of the lines (:mod:`warpshadow.stages.silhouettes.fin
 
     c + Σ_k e_k (ω_k − Σ_l π_kl max(ω_k + ω_l − 1, 0) e_l) (c_k − c)          l: the two directions across k
 
-which is a mean: the weights are positive, and at most 1 in all. The inner sum is the overlap of two areas: nothing if
-they lie beyond one line, their product if they lie beyond two upright ones. Each of the two loses half of it, π = ½.
-Only if one lies beyond the end of a surface (π = 0) and the other beyond a crease of it (π = 1), the crease's loses all
-of it.
+This is a mean: the weights are positive, and at most 1 in all. The inner sum is the overlap of two areas: nothing if
+they lie beyond one line, their product if beyond two upright ones, of which each loses half, π = ½. If one lies beyond
+the end of a surface (π = 0) and the other beyond a crease of it (π = 1), the crease's loses all of it.
 """
 
 import functools

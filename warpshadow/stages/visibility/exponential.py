@@ -4,14 +4,14 @@ exp*(f) = e^{f0/√4π} exp*(f̂ / 2^p)^{2^p}            [Lyu et al. 2021, secti
 
 Squarings are *held* where they would explode (:mod:`.held_squares`).
 
-The number of squarings is *blended*. p, the least with t = |f̂| / (2^p T) ≤ 1, jumps as |f̂| grows. The value would
-jump with it, by some tenths of a percent, and finite differences of images would be wrong there. For p > 0, t is in
-(½, 1]. From t = ½ on the base approximation q of f / 2^p is blended with the square of q of f / 2^{p+1},
+The number of squarings is *blended*, so that the value does not jump with p, the least with t = |f̂| / (2^p T) ≤ 1 (by
+some tenths of a percent, where finite differences of images would be wrong). For p > 0, t is in (½, 1]. From t = ½ on
+the base approximation q of f / 2^p is blended with the square of q of f / 2^{p+1},
 
     (1 − w) q(f / 2^p) + w q(f / 2^{p+1})²,    w = smoothstep((t − ½) / (BLEND_END − ½))
 
-and from t = BLEND_END on, w = 1. At t = 1, p + 1 squarings take over, at their t = ½ and w = 0, with the same value,
-and v has a continuous derivative. It costs one product more.
+and from t = BLEND_END on, w = 1. At t = 1, p + 1 squarings take over, at their t = ½ and w = 0, with the same value and
+a continuous derivative. It costs one product more.
 """
 
 import functools
