@@ -133,8 +133,7 @@ def find_patches(
     piece that is mostly inside, and reaches out, sends the light of the nearest patch, whose area does not count it.
 
     Args:
-        positions: Vertices [units of the body], shape [vertex, 3].
-        faces: Faces that wind alike, shape [face, 3].
+        positions, faces: Vertices [units of the body], shape [vertex, 3], and faces that wind alike, [face, 3].
         is_two_sided: Whether the backs of faces send light, too: each side then has half of the patches.
         count: Number of patches, at most.
         patch_samples: Number of patch samples of each, at most.
@@ -285,8 +284,7 @@ def _cut_faces(
     """Halve faces across their longest edges, until none is longer than 1.
 
     Args:
-        positions: Vertices [units of the body], shape [vertex, 3].
-        faces: Faces, shape [face, 3].
+        positions, faces: Vertices [units of the body], shape [vertex, 3], and faces, [face, 3].
         to_unit_lengths: Maps points [..., 3] to the space in which lengths count.
     """
     face_corners = positions.astype(np.float64)[faces]

@@ -72,7 +72,6 @@ def colored_light(transfer: ColoredTransfer, light: wp.array) -> wp.array:
     """Light receivers by coefficients.
 
     Args:
-        transfer: Of the receivers.
         light: Coefficients of the light, linear RGB, vec3 of shape [batch, coefficient].
     Returns:
         vec3 of shape [batch, receiver].

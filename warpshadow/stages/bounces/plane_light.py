@@ -181,8 +181,7 @@ def plane_light(
     """Light that planes send to receivers.
 
     Args:
-        points: Receivers [scene units], vec3 of shape [batch, receiver].
-        normals: Their unit normals, vec3 of shape [batch, receiver].
+        points, normals: Receivers [scene units] and their unit normals, vec3 of shape [batch, receiver].
         transmittance: Past all else, without the planes, float32 of shape [batch, receiver, direction].
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`PlaneBlockers.frames`.
         texels: Radiosity of the planes, vec3 of shape [batch, texel], from :func:`.plane_texels.find_texels`. A batch

@@ -47,7 +47,6 @@ def find_texels(
     Args:
         radiosity: Of the patches of all bodies, vec3 of shape [batch, patch].
         patch_weights: v of each patch, in three equal channels, vec3 of shape [batch, patch]. Either batch may be 1.
-        planes: The planes.
         weight_sums: From :func:`sum_weights`, where they are found already.
     Returns:
         vec3 of shape [batch, texel].

@@ -308,7 +308,6 @@ def part_coverage(
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
         placed_parts: Where the parts are, from :meth:`.ConvexBlockers.place`; the batch may be 1.
-        blockers: The bodies.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         radius: Of cells that do not tile the sphere [rad]; by default that of so many even ones, which do.
         horizon_normals: Normals, vec3 of shape [batch, receiver]: nothing blocks cells below the horizon.

@@ -337,8 +337,6 @@ def find_log_transmittance_of_parts(
 
     Args:
         points, normals, samples, span: As for :func:`.sphere_transmittance.find_log_transmittance`.
-        placed_parts: Where the parts are.
-        blockers: The bodies that consist of them.
         skipped: Indices of bodies among these that do not block, −1 for none: the receivers' and the emitter's.
     Returns:
         Float32 of shape [batch, receiver, sample].

@@ -113,8 +113,6 @@ def find_self_visibility(
     Args:
         positions, faces: Its mesh [units of the body], shapes [vertex, 3] and [face, 3].
         sample_points: Middles of its samples [units of the body], shape [sample, 3].
-        surface_points: Points of each sample.
-        is_two_sided: Whether it is open.
     Returns:
         None for a body that hides next to nothing of itself, such as a convex one.
     """
@@ -231,9 +229,6 @@ def look_up_self_visibility(
 
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
-        samples: Of all emitters.
-        span: Those of the emitter.
-        self_visibility: Its own.
         is_on_emitter: Whether the receivers lie on the emitter.
     Returns:
         Float32 of shape [batch, receiver, sample].

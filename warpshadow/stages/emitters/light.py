@@ -247,11 +247,8 @@ def sum_light(
     """Light of an emitter on receivers.
 
     Args:
-        points: Receivers [scene units], vec3 of shape [batch, receiver].
-        normals: Their unit normals, vec3 of shape [batch, receiver].
-        samples: Of all emitters.
+        points, normals: Receivers [scene units] and their unit normals, vec3 of shape [batch, receiver].
         radiance: Of the samples, linear RGB, vec3 of shape [batch, sample].
-        span: Those of the emitter.
         transmittance: To these, float32 of shape [batch, receiver, sample]; None for 1. Any batch may be 1.
     Returns:
         vec3 of shape [batch, receiver].

@@ -159,7 +159,6 @@ def _cut_rectangle(
     Args:
         table: Importance of all above and left of each corner of pixels, [height + 1, width + 1].
         rows, columns: Where it begins and ends.
-        count: Number of rectangles.
     """
     if count == 1:
         yield rows, columns

@@ -247,8 +247,7 @@ def find_fronts(
     """Weight of each plane's front for each receiver, and receivers lifted off planes in which they lie.
 
     Args:
-        points: The receivers [scene units], vec3 of shape [batch, receiver].
-        normals: Their unit normals, vec3 of shape [batch, receiver].
+        points, normals: Receivers [scene units] and their unit normals, vec3 of shape [batch, receiver].
         body_sides: From :func:`find_body_sides`, float32 of shape [batch, body, plane]. None where it is not known:
             receivers are in front down to the plane itself.
         spheres: The blockers nearest to patch samples; None where no receiver is one.

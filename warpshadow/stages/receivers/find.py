@@ -335,8 +335,7 @@ def receivers_on_faces(
     """Make receivers of given points on faces, for light alone: no image gets it from them.
 
     Args:
-        positions: Vertices [scene units], vec3 of shape [batch, vertex].
-        normals: Unit normals of the vertices, vec3 of shape [batch, vertex].
+        positions, normals: Vertices [scene units] and their unit normals, vec3 of shape [batch, vertex].
         faces: Vertex indices, vec3i of shape [face].
         sides: Faces, from the front or from behind, int of shape [receiver].
         barycentrics: Where on them, shape [receiver, 3].

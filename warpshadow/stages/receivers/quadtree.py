@@ -57,7 +57,6 @@ def probe_grid(size: tuple[int, int], supersampling: int) -> tuple[np.ndarray, n
 
     Args:
         size: Height and width of the image [samples].
-        supersampling: Samples of a pixel across and down.
     """
     spacing = probe_spacing(size, supersampling)
     counts = (MAX_SIDE // spacing * -(-length // (supersampling * MAX_SIDE)) + 1 for length in size)
@@ -197,7 +196,6 @@ def find_quadtree(
         keys: A number for each side, equal for sides in one plane, −1 for sides without squares.
         probe_shares: Light at the samples of :func:`probe_grid`, over that where nothing blocks any, float32 of shape
             [view, row, column]; anything where they see no side that has squares.
-        supersampling: Samples of a pixel across and down.
         tolerance: Error of interpolation at which a square is cut, in the unit of the shares.
     """
     device, (view_count, height, width) = sides.device, sides.shape

@@ -238,7 +238,6 @@ def find_sample_receivers(
         side_count: Faces that receivers at vertices have.
         wants_samples: Faces whose samples have receivers, bool of shape [face].
         bodies: Body of each face, −1 for faces that need not be told apart, shape [face].
-        supersampling: Samples of a pixel across and down.
         quadtree: Squares at whose corners there are receivers; None for none.
         surface: Visible surface of one instance, where samples of a pixel share a receiver if they see different faces
             of one smooth surface, too; None where they do not.
@@ -340,7 +339,6 @@ def places_in_pixels(samples: wp.array, width: int, supersampling: int) -> wp.ar
     Args:
         samples: The samples, int32 of shape [batch, receiver].
         width: Samples of an image in a row.
-        supersampling: Samples of a pixel across and down.
     """
     places = empty(samples.shape, dtype=wp.int32, device=samples.device)
     launch(_find_places, samples.shape, inputs=[samples, width, supersampling], outputs=[places])
@@ -371,7 +369,6 @@ def _number_by_body(
 
     Args:
         views, ranks: View and body of each receiver.
-        view_count, body_count: Numbers of them.
     Returns:
         The number of each; and where the bodies begin, and the last ends.
     """
@@ -388,7 +385,6 @@ def fragments_of_samples(fragments: Fragments, samples: np.ndarray) -> Fragments
     """Select the fragments of some samples: sides and barycentrics [view, sample], without a gradient.
 
     Args:
-        fragments: The fragments of all samples.
         samples: Which, int of shape [view, sample], −1 for none.
     """
     sides = rows(fragments.face_ids if fragments.sides is None else fragments.sides)

@@ -188,8 +188,6 @@ def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingK
 
     Args:
         rotations: R of each body, mat33 of shape [batch, body].
-        body: Index of the body.
-        kernels: Of the cells.
     Differentiable: rotations.
     """
     shape = len(rotations), kernels.directions.size

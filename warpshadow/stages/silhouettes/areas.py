@@ -146,7 +146,6 @@ def measure_areas(samples: wp.array, edges: wp.array, entries: wp.array, arrays:
         samples: Of each entry, int32 of shape [entry].
         edges: Vertices of the line in each direction, vec2i of shape [entry, 4].
         entries: Of each sample, int32 of shape [sample].
-        arrays: The fragments as kernels take them.
     Returns:
         The area e beyond each line, its weight ω, and whether a surface ends there, 1, or has a crease, 0;
         vec3 of shape [entry, 4], zero where there is no line.

@@ -125,8 +125,7 @@ def merge(centers: wp.array, radii: wp.array) -> ClusterNodes:
     """Merge every four consecutive spheres; the remainder stays as it is.
 
     Args:
-        centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
-        radii: Sphere radii [scene units], float32 of shape [batch, sphere].
+        centers, radii: Spheres [scene units], vec3 and float32 of shape [batch, sphere].
     Differentiable: centers, radii.
     """
     batch_count, sphere_count = radii.shape
