@@ -203,10 +203,9 @@ def tune(
 ) -> Tuning:
     """Measure settings of a scene, and choose the cheapest that reaches an error, or the best within a time.
 
-    Tried are all methods but rays, as far as they show all that the scene has; 32 to 512 directions, where bodies shine
-    no fewer than by default; orders 4, 6 and 8;
-    16 to 512 spheres for bodies that say how many; and every pixel as a receiver for bodies whose vertices miss
-    shadows.
+    Tried are all methods but rays that show all that the scene has; 32 to 512 directions, where bodies shine no fewer
+    than by default; orders 4, 6 and 8; 16 to 512 spheres for bodies that say how many; and every pixel as a receiver
+    for bodies whose vertices miss shadows.
 
     Args:
         scene: The scene; its "auto" is not looked at.

@@ -47,7 +47,7 @@ class ProjectedLight(Protocol):
 class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     """A method in which spheres stand in for the bodies: visibility, transfer vectors, and shading.
 
-    Its two types say in which basis it has light, and visibility. A method gives these members, besides those of
+    Its two types are those of light and of visibility in its basis. A method gives these members, besides those of
     :class:`.Method` for bodies that shine:
 
     | member | needed for | default |

@@ -163,8 +163,7 @@ def trace_form_factors(
         F_xp = 1/π ∫ [x sees p towards ω] max(n·ω, 0) dω
 
     so that Σ_p F_xp B_p is the light that x, if white, reflects of the radiosity B of patches. Rays are as dense as the
-    cosine, on a lattice that is turned at random for each receiver; an F has a standard error of at most
-    √(F (1 − F) / rays), and less, since a lattice is even.
+    cosine, on a lattice that is turned at random for each receiver: F has a standard error below √(F (1 − F) / rays).
 
     Args:
         mesh: The mesh for rays; :func:`patch_mesh` makes it of a body.

@@ -13,8 +13,8 @@ and likewise to the other sides:
 - Where another surface comes in front before the neighbor's center, or the image ends, the opposite half counts alone.
 - Where all neighbors see the same face, the slope is the face's own.
 
-These steps add up along a row to the color at the surface's right edge minus that at its left, which is what the moving
-edges contribute with the other sign. So the two cancel, as they must, if
+These steps add up along a row to the color at the surface's right edge minus that at its left, which the moving edges
+contribute with the other sign. So the two cancel, as they must, if
 
 - the step to an edge follows the edge's point, and
 - a sample counts along a row as far as its surface reaches there: 1, or ½ + t beside an edge (along a column likewise).

@@ -242,9 +242,9 @@ def find_receivers(
         positions: Vertices [scene units], vec3 of shape [batch, vertex].
         normals: Unit normals of the vertices, vec3 of shape [batch, vertex].
         faces: Vertex indices, vec3i of shape [face].
-        fragments: The fragments, one batch for all or one each.
-        numbering: The vertices that are receivers: all vertices of a face that a sample sees, unless the face wants
-            samples; with their backs where fragments have sides.
+        fragments: Of one batch for all, or of one each.
+        numbering: The vertices that are receivers: those of faces that a sample sees, unless the face wants samples;
+            with their backs where fragments have sides.
         wants_samples: Faces whose samples have receivers of their own, bool of shape [face].
         bodies: Body of each face, −1 for faces that need not be told apart, shape [face]; None where all share their
             blockers, as for :func:`number_receivers`.

@@ -156,11 +156,10 @@ def smooth_silhouettes(
             go; by default the colors of samples.
     Returns:
         Smoothed image, like ``image``; a sample lies within the range of itself and its four neighbors.
-    Differentiable: image; clip_positions, exactly on average over where samples lie (an edge counts by the motion of
-    its points, :mod:`warpshadow.stages.silhouettes.areas`); overlaps of areas are left out. Without edge colors an edge
-    has the colors of the samples beside it: where shading changes by δ over a sample there, its gradient is δ/2 off.
-    Excluded are intersections within one surface, cuts by the near plane, and surfaces that leave the image: there is
-    no neighbor to take from.
+    Differentiable: image; clip_positions, exactly on average over where samples lie
+    (:mod:`warpshadow.stages.silhouettes.areas`), but for overlaps of areas, intersections within one surface, cuts by
+    the near plane, and surfaces that leave the image, where there is no neighbor to take from. Without edge colors an
+    edge has the colors of the samples beside it: where shading changes by δ over a sample, its gradient is δ/2 off.
     """
     fragments = silhouettes.fragments
     batch_count, height, width = fragments.face_ids.shape

@@ -365,13 +365,10 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
 
 
 def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float | None = None) -> wp.array:
-    """Exponentiate log-visibility with the SH product, by scaling and squaring.
+    """Exponentiate log-visibility with the SH product, by scaling and squaring (the formula is the module's).
 
-        exp*(f) = e^{f0/√4π} exp*(f̂ / 2^p)^{2^p},  p the least with |f̂| / 2^p ≤ threshold
-                                                     [Lyu et al. 2021, section 3.3.3; Ren et al. 2006, section 5]
-
-    Squarings are held where the result would rise above 1, as where hundreds of spheres overlap (see the module): it is
-    then bounded, and draws a warning.
+    Squarings are held where the result would rise above 1, as where hundreds of spheres overlap: it is then bounded,
+    and draws a warning.
 
     Args:
         log_sh: Log-visibility f, float32 of shape [batch, receiver, order²], f̂ being f without its constant part.
