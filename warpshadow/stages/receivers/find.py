@@ -252,8 +252,8 @@ def find_receivers(
         quadtree: Squares in which samples of faces that want them interpolate; None for none.
         smooth_pieces: Smooth piece of each face, int32 of shape [face], where samples that see different faces of one
             share a receiver, too; None where they do not.
-        rises: Whether receivers of samples, from which rays leave, are lifted from their flat faces onto the curved
-            surface that the vertex normals describe.
+        rises: Whether receivers of samples, from which rays leave, are lifted from flat faces onto
+            the curved surface that the vertex normals describe.
         has_mean_slope, shares_receivers: As for :func:`.sample_receivers.find_sample_receivers`.
     Returns:
         Receivers; where no face wants samples, many views of one geometry share them. While a graph is captured every
