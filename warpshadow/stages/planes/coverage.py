@@ -3,9 +3,8 @@
     h_q = Σ_k h_qk,  μ_q = Σ_k μ_qk
 
 h_qk and μ_qk are the coverage of cell q by plane k (:mod:`warpshadow.stages.cell_coverage`). Plane blockers that share
-a cell mostly meet in it, as walls do, and cover different parts of it.
-
-So a cow over a ground is 0.7% off in direct light, with a large sphere in place of the plane 2.3%.
+a cell mostly meet in it, as walls do, and cover different parts of it. (A cow over a ground is 0.7% off in direct
+light, with a large sphere in place of the plane 2.3%.)
 """
 
 import numpy as np

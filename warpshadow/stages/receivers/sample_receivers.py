@@ -1,10 +1,12 @@
 """Sample receivers: points that samples see, at which light is evaluated for them.
 
-Samples of a pixel that see the same side share one, at the mean of their points: of four samples, 1.1 to 1.5 receivers
-a pixel. On bodies that shine each sample has its own, but by rays: means leap as samples pass to the next face, and
-narrow highlights with them. In stills samples of different faces share one, too, if these belong to one smooth piece
-and the surface is even: shared by two slats of a bench, it would lie in the gap. In squares of a quadtree there is one
-at each corner, and samples interpolate in triangles of these.
+- Samples of a pixel that see the same side share one, at the mean of their points: of four samples, 1.1 to 1.5
+  receivers a pixel.
+- On bodies that shine each sample has its own, but by rays: means leap as samples pass to the next face, and narrow
+  highlights with them.
+- In stills samples of different faces share one, too, if these belong to one smooth piece and the surface is even:
+  shared by two slats of a bench, it would lie in the gap.
+- In squares of a quadtree there is one at each corner, and samples interpolate in triangles of these.
 """
 
 import functools

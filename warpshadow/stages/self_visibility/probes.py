@@ -1,10 +1,9 @@
 """Probes: the points of a body at which self-visibility is tabulated, and the interpolation between them.
 
 Probes are the body's vertices and, where edges are long, points between them: light changes along a rail that has no
-vertex between its ends. Faces are cut at the middle of their longest edge, and so are their pieces, until no edge is
-longer than is wanted, nor cut by the face beside it (Rivara 1984), so faces agree. The visibility of a
-sample is interpolated between the corners of its piece. The first probes are the vertices; the backs of all probes of
-an open body follow.
+vertex between its ends. Faces and their pieces are cut at the middle of their longest edge until no edge is too long,
+nor cut by the face beside it, so that faces agree (Rivara 1984). The visibility of a sample is interpolated between the
+corners of its piece. The first probes are the vertices; the backs of all probes of an open body follow.
 """
 
 from collections.abc import Callable
