@@ -405,17 +405,15 @@ def sphere_light(
     """Light that proxies send to receivers, through the cells that they block.
 
     Args:
-        points, normals, centers, radii: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
+        points, normals, centers, radii, directions, softness, merging, skip, clusters: As for
+            :func:`warpshadow.stages.visibility.directional.transmittance`.
         proxy_radiance: Light and area that proxies, clusters included, show towards cells, vec4 of shape [batch, proxy,
-            direction], from :func:`.proxy_radiance.find_proxy_radiance`. A batch of 1 serves every instance.
+            direction], from :func:`.proxy_radiance.find_proxy_radiance`.
         transmittance: T past these spheres and all else that F is past, float32 of shape [batch, receiver, direction],
             made with the same directions, softness, merging and skip.
-        transmittance_others: F, the factor of T without these spheres, of the same shape; a batch of 1 serves every
-            instance. None for 1.
-        directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.fibonacci`.
-        softness, merging, skip, clusters: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
-        tangent_planes: Of the proxies, which show nothing below them. A batch of 1 serves every instance. None for
-            proxies that are seen from everywhere.
+        transmittance_others: F, the factor of T without these spheres, of the same shape; None for 1.
+        tangent_planes: Of the proxies, which show nothing below them; None for proxies that are seen from everywhere.
+            Batches of 1 of these, of proxy_radiance and of transmittance_others serve every instance.
     Returns:
         Light that a white receiver reflects of it, vec3 of shape [batch, receiver]: 1 where all patches are white and
         radiant by 1.

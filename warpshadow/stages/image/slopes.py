@@ -394,9 +394,9 @@ def moving_radiance(
     Returns:
         Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width]; and the edge colors, with which
         :func:`warpshadow.stages.silhouettes.smooth.smooth_silhouettes` is to be called.
-    Differentiable: shading, albedo, clip_positions; the latter in place of barycentrics of the fragments, but for the
-    samples that are receivers themselves or interpolate between such, whose gradient is that of the receivers' points
-    unless they have mean slopes. By albedo samples are moved where it has a mean slope.
+    Differentiable: shading, albedo, clip_positions. The latter stand for the barycentrics of the fragments, but not of
+    samples that are receivers themselves, or interpolate between such, without mean slopes: these have the gradient of
+    the receivers' points. By albedo samples are moved where it has a mean slope.
     """
     fragments = replace(fragments, barycentrics=without_gradient(fragments.barycentrics))
     samples = sample_radiance(fragments, faces, shading, albedo)

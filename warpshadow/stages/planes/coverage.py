@@ -196,8 +196,8 @@ def plane_coverage(
     Returns:
         vec4 of shape [batch, receiver, direction], for :func:`warpshadow.stages.joint_coverage.transmittance_past`; h
         is 1 or more where nothing passes. None where no plane casts a shadow on them.
-    Differentiable: points, frames, front_weights. Not: horizon_normals, which decide by steps,
-    and how much receivers in a plane see of a cell.
+    Differentiable: points, frames, front_weights. Not: horizon_normals, which decide by steps, and how much receivers
+    in a plane see of a cell.
     """
     check_planes(planes, points, frames, directions, skip)
     count = common_batch({"points": points, "frames": frames, "front_weights": front_weights})
