@@ -149,8 +149,6 @@ def test_a_map_is_seen_where_its_pixels_are():
     turned = np.radians(360 / 16 * 3.5)  # φ = 2π (column + ½) / 16: between columns 2 and 3
     between = light.radiance_from([np.sin(turned - np.pi / 16), 0, -np.cos(turned - np.pi / 16)])
     np.testing.assert_allclose(between, light.radiance[3:5, 2:4].mean(axis=(0, 1)), atol=1e-6)
-    with pytest.warns(DeprecationWarning, match="it is called radiance_from"):
-        np.testing.assert_array_equal(light.towards(light.directions()), light.radiance_from(light.directions()))
 
 
 @pytest.mark.parametrize("kind", ["map", "harmonics"])

@@ -40,11 +40,6 @@ def test_on_the_device_where_it_is_nothing_is_made_anew(renderer):
     assert renderer.array_renderer is before
 
 
-def test_the_former_name_of_its_array_renderer_warns(renderer):
-    with pytest.warns(DeprecationWarning, match="array_renderer"):
-        assert renderer.warp is renderer.array_renderer
-
-
 def test_elsewhere_it_is_made_anew(renderer, monkeypatch):
     made = []
     monkeypatch.setattr(ws.Renderer, "moved", lambda self, device: made.append(device) or self)

@@ -44,7 +44,7 @@ def test_another_process_fills_the_caches_and_says_how_far_it_is():
     Preparation(scene(), notes.append)
     eventually(lambda: "" in notes)
     assert is_cached_on_disk(Painter(scene())) and len(cached_files("spheres")) == 1
-    assert len(cached_files("own_shadows")) == 2  # as it moves, and at rest
+    assert len(cached_files("self_shadows")) == 2  # as it moves, and at rest
     assert all(note.startswith("rendering: ") for note in notes[:-1]) and notes[-1] == ""  # a fast one says nothing
 
 

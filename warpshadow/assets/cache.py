@@ -13,11 +13,11 @@ from warpshadow import check
 from warpshadow.assets import files
 
 Item = TypeVar("Item")
-Kind = Literal["spheres", "own_shadows", "form_factors"]
+Kind = Literal["spheres", "self_shadows", "form_factors"]
 
 KINDS: Mapping[Kind, str] = {
     "spheres": "fits of spheres",
-    "own_shadows": "shadows of bodies on themselves",
+    "self_shadows": "shadows of bodies on themselves",
     "form_factors": "form factors of bounces within bodies",
 }
 """Kinds of cached results, by folder."""

@@ -283,11 +283,6 @@ class EnvironmentMap:
             radiance += weight[..., None] * self.radiance[rows, columns]
         return radiance
 
-    def towards(self, directions: np.ndarray) -> np.ndarray:
-        """Do the same as :meth:`radiance_from`, its name from now on."""
-        check.warn("EnvironmentMap.towards: it is called radiance_from from now on", DeprecationWarning)
-        return self.radiance_from(directions)
-
     def directions(self) -> np.ndarray:
         """Unit vectors to the pixel centers, float32, shape [height, width, 3]."""
         return sh.equirectangular_directions(len(self.radiance)).astype(np.float32)

@@ -59,21 +59,20 @@ class Material(NamedTuple):
 def load_mesh(path: MeshSource) -> Mesh:
     """Read an OBJ, PLY, STL, GLB/glTF or USD file, or trimesh's objects, as one mesh.
 
-    Vertices keep the file's order and none is merged or dropped; but STL, where each face has three vertices of its
-    own, is welded, except that edges which bend by more than 30° stay parted where the mesh has many sharp ones (its
-    ``rounds_edges`` would be true), as boxes have. Faces that are listed twice are dropped. Polygons become fans of
-    triangles. The nodes of a scene are concatenated in world space. Where a format ties uvs to vertices (PLY, glTF),
-    faces refer to the first of the vertices that are duplicated only for their uvs (same position and color, and same
-    normal where the file stores normals; of trimesh's objects, normals that bend by 30° or less), so that a seam does
-    not break the shading. PLY and trimesh's objects without stored normals are joined as by :meth:`Mesh.welded`; others
-    without uvs stay as they are. A USD stage is read at its earliest time, z-up turned to y-up, subdivision surfaces as
-    their control cage. uvs are kept only when every face has them. Textures are not read: they are a body's, and
-    ``Body(path)`` takes them.
-
-    Colors are read where each vertex gets one: from vertices; from faces, where no vertex has faces of two colors; and
-    from the base color factor of a glTF material. PLY and OBJ files and trimesh have sRGB, which is decoded; glTF and
-    USD (``displayColor``) have linear values; so have meshes of trimesh whose ``source`` is glTF, but not copies of
-    them. Transparency does not count, nor the ``Kd`` of .mtl files.
+    - **Vertices** keep the file's order, and none is merged or dropped, but: STL, where each face has three vertices of
+      its own, is welded, except at edges that bend by more than 30° if the mesh has many (``rounds_edges``), as boxes
+      have. PLY and trimesh's objects without stored normals are joined as by :meth:`Mesh.welded`.
+    - **Seams.** Where a format ties uvs to vertices (PLY, glTF), faces refer to the first of the vertices that are
+      duplicated only for their uvs: same position and color, and same normal where the file stores normals (of
+      trimesh's objects, normals that bend by 30° or less). So a seam does not break the shading.
+    - **Faces** that are listed twice are dropped. Polygons become fans of triangles. The nodes of a scene are
+      concatenated in world space.
+    - **USD** is read at its earliest time, z-up turned to y-up, subdivision surfaces as their control cage.
+    - **Textures** are a body's, and ``Body(path)`` takes them. uvs are kept only when every face has them.
+    - **Colors** are read where each vertex gets one: from vertices; from faces, where no vertex has two colors; from
+      the base color factor of a glTF material. PLY, OBJ and trimesh have sRGB, which is decoded; glTF, USD
+      (``displayColor``) and meshes of trimesh whose ``source`` is glTF, but not copies of them, have linear values.
+      Transparency does not count, nor the ``Kd`` of .mtl files.
 
     Args:
         path: A .obj, .ply, .stl, .glb, .gltf, .usd, .usda, .usdc or .usdz file; or a ``trimesh.Trimesh``, or the meshes

@@ -1,24 +1,16 @@
 """Lanes: how one thread works on several receivers at once.
 
-Warp runs a CPU kernel one thread after another. A thread that owns one receiver leaves the vector units idle; so here
-a thread owns a *block* of receivers and holds each quantity as one vector with a lane for every receiver: as many as a
-vector register has floats on a CPU, 1 on a GPU, where threads play that part. Arrays that stages hand on stay
-[batch, vertex, …]; vectors of lanes fill scratch memory, and arrays that one stage stores for its adjoint. A block that
-runs past the last receiver repeats it, and writes it once.
+A thread owns a *block* of receivers and holds each quantity as one vector with a lane for every receiver: as many as a
+vector register has floats on a CPU, where Warp runs a kernel one thread after another and one receiver would leave the
+vector units idle; 1 on a GPU, where threads play that part. Arrays that stages hand on stay [batch, receiver, …];
+vectors of lanes fill scratch memory, and arrays that one stage stores for its adjoint. A block that runs past the last
+receiver repeats it, and writes it once.
 
 Small functions on structs are inlined by force. Otherwise LLVM calls them, and copies the structs through memory:
 kernels of visibility take 1.1 to 1.35 times as long.
 
-How wide registers are is asked of the LLVM that compiles the kernels. For some CPUs it prefers narrower ones than there
-are, so the width is among the flags. ``python demos/benchmarks/lane_choice.py`` times the alternatives; forward and
-backward, one thread, AMD EPYC (Zen 4), in ms:
-
-| lanes in registers of | `directional` | log-SH, sum | log-SH, exponentiation |
-| --- | --- | --- | --- |
-| 16 in 512 bits (chosen) | 42 | 42 | 87 |
-| 16 in 256 | 65 | 68 | 78 |
-| 8 in 256 (as with AVX2) | 50 | 44 | 120 |
-| 4 in 128 (as with SSE, Neon) | 72 | 77 | 198 |
+How wide registers are is asked of the LLVM that compiles the kernels; for some CPUs it prefers narrower ones than there
+are, so the width is among the flags. README.md beside this file has the times of other widths.
 """
 
 import contextlib

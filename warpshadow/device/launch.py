@@ -34,18 +34,22 @@ def launch(
 
     Outputs of a kernel with Warp's own adjoint require a gradient if an input does; the launch is then recorded.
 
+    | arguments, in this order | the kernel | Warp's adjoint |
+    | --- | --- | --- |
+    | ``first_row``, ``worker`` | has them if it has a cost | |
+    | ``inputs`` | reads them | one row adds to a place in their gradients |
+    | … those ``shared`` by rows | reads them | all rows add to their gradients |
+    | ``scratch`` | a row for each worker on a CPU, for each thread on a GPU, if it has a cost | knows it not |
+    | ``outputs`` | one row writes to a place in them | they require a gradient |
+    | ``sums``, None to skip one | all rows add to them | knows them not |
+
     Args:
-        kernel: Its arguments are inputs, scratch memory, outputs and sums; before them ``first_row`` and ``worker`` if
-            it has a cost.
-        dim: Threads in Warp's sense; if the kernel has a cost, the first dimension is that of rows, which write to
-            different places.
-        inputs, outputs: Arguments. An output that is to require a gradient must not be a view made before it does.
-        sums: Outputs that all rows add to; None to skip one.
-        scratch: Memory for a kernel that has a cost: a row for each worker on a CPU, and for each thread on a GPU.
+        kernel: The kernel.
+        dim: Threads in Warp's sense; if the kernel has a cost, the first dimension is that of rows.
+        outputs: One that is to require a gradient must not be a view made before it does.
         cost: Roughly how long a thread takes [ns]: on a CPU the launch is cut into slices if they are worth it, which
             run on all cores (:mod:`warpshadow.device.parallel`). None runs it on one.
-        shared: Inputs that several rows read, of a kernel that has a cost and Warp's own adjoint: all rows add to their
-            gradients. To a place in the gradient of another input only one row may add.
+        shared: Of a kernel that has a cost and Warp's own adjoint.
     """
     device = _device_of((*outputs, *sums, *inputs))
     needs_gradient = kernel.options.get("enable_backward") is not False and varies(inputs)
@@ -110,20 +114,20 @@ def launch_with_adjoint(
 ) -> wp.array:
     """Launch a kernel whose adjoint is another kernel, written by hand, and put that on the tape.
 
-    Arguments of the kernel are inputs, scratch memory, outputs and the result. Those of its adjoint are inputs,
-    ``adj_inputs`` and the gradient of the result; scratch memory; and the gradients of the variables and of those that
-    are shared, to which it adds, None for a variable that has none.
+    | arguments of both, in this order | the kernel | its adjoint |
+    | --- | --- | --- |
+    | ``inputs`` | reads them | reads them |
+    | ``adj_inputs``, such as outputs; the gradient of ``result`` | – | reads them |
+    | ``scratch``; ``adj_scratch`` | has the first | has both |
+    | ``outputs``, ``result`` | writes them | – |
+    | gradients of ``variables``, None for one without | – | one row adds to a place in them |
+    | gradients of ``shared`` variables | – | all rows add to them |
 
     Args:
         kernel, dim, scratch, cost: As for :func:`launch`.
         adjoint_kernel: The adjoint, or a function that makes it, which is called where there is a gradient.
-        inputs: Arguments of both kernels.
         result: Memory for the result, as for :func:`differentiable`.
-        variables: Arrays that the result depends on differentiably, to a place of whose gradients one row adds.
-        shared: Likewise, arrays to whose gradients all rows add.
-        outputs: Arrays that the kernel writes beside the result.
-        adj_inputs: Arrays that only the adjoint reads, such as outputs.
-        adj_scratch: Scratch memory that only the adjoint has.
+        variables, shared: Arrays that the result depends on differentiably.
         adj_cost: Cost of the adjoint; by default twice that of the kernel.
     Returns:
         The result.

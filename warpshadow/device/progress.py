@@ -23,7 +23,7 @@ from warpshadow.device.warp_internals import around_compilation, load_silently
 _DELAY = 1.0  # time before a bar shows, and between its states where nothing is done [s]
 _LINE_INTERVAL = 10.0  # time between lines [s]
 
-ANNOUNCED_SECONDS = 30.0  # time of work that is with_lock_and_progress, with the way around it [s]
+ANNOUNCED_SECONDS = 30.0  # time of work beyond which it is announced, with the setting that avoids it [s]
 
 _bars_show = True  # whether bars and lines may show, in all of the process
 

@@ -381,9 +381,9 @@ def fit(
             ``optimizer=torch.optim.SGD``.
         optimizer: Makes an optimizer of a list of tensors and ``lr``: any class of ``torch.optim``, by default
             :func:`default_optimizer`.
-        seed: Of candidates that are drawn at random.
         tolerance: A stage has converged when over 25 iterations, or by the last and the next step of a QuasiNewton, its
             loss falls by less than this part.
+        seed: Of candidates that are drawn at random.
         checkpoint: File to which the state is written, and from which a fit goes on where one that was interrupted left
             off, with the result that it would have had (on a CPU, to the bit). A line says from which iteration.
         checkpoint_seconds: Time between checkpoints [s].

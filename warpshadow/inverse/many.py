@@ -103,8 +103,8 @@ def fit_many(
             you call it again. They are asked for as workers become free.
         folder: Made if it is not there. Each fit gets a subfolder of its name, with the files of
             :meth:`~warpshadow.inverse.report.Report.write`; table.csv says how each ended.
-        stages, optimizer, tolerance, seed: Of problems, as :func:`warpshadow.inverse.fit` takes them. Fits and fit
-            files have their own.
+        stages, optimizer, tolerance, seed: As for :func:`warpshadow.inverse.fit`, of problems; fits and fit files have
+            their own.
         workers: How many fits at a time; on this machine by default one for each of ``ws.thread_count()`` threads,
             which they share, or on a GPU one; with ``ray`` one for each core, or GPU, of the cluster.
         ray: Address of a Ray cluster, "HOST:PORT" or "auto", whose machines see the same files under the same paths.

@@ -27,18 +27,15 @@ _MAX_SCALE_RATIO = 1e4  # of the rest of that ratio
 class QuasiNewton(torch.optim.Optimizer):
     """L-BFGS with bounded steps, one evaluation each.
 
-    The direction is that of Nocedal and Wright 2006, algorithm 7.4, but curvature that no step has told of is not taken
-    to be alike in all tensors: one with a scale of its own beyond tenfold of that of all has it, but for that tenfold.
-    Else it would be the steepest one's: a flat tensor would not move, and promise nothing, so that the fit would count
-    as converged. (The roughness of a shiny ball had 1e4 times the curvature of a dull bunny's.)
-    Curvature of a tensor is told by the change of its gradient over a step, not by how far it went itself: so a flat
-    tensor whose gradient changes since the loss couples it to a steep one is not taken to be steep.
-
-    No value changes by more than a bound. A step that lowers the loss is kept, and the bound grows if it was reached.
-    Another one is taken back and makes the bound shorter; the gradient at its end tells of curvature nonetheless.
-
-    Values may be clamped after a step. One that was stays where it is as long as the loss would fall beyond, and the
-    direction is that of the others [Nocedal and Wright 2006, section 16.7, gradient projection].
+    - **Direction:** that of Nocedal and Wright 2006, algorithm 7.4, but curvature that no step has told of may differ
+      between tensors: one whose scale is beyond tenfold of that of all has its own, but for that tenfold. By one scale,
+      the steepest tensor's, a flat one would not move, and the fit would count as converged. (The roughness of a shiny
+      ball had 1e4 times the curvature of a dull bunny's.) The change of a tensor's gradient over a step tells of its
+      curvature, not how far it went itself: the loss may couple a flat tensor to a steep one.
+    - **Length:** no value changes by more than a bound. A step that lowers the loss is kept, and the bound grows if it
+      was reached. Another one is taken back and makes the bound shorter; its gradient tells of curvature nonetheless.
+    - **Clamped values** stay where they are as long as the loss would fall beyond, and the direction is that of the
+      others [Nocedal and Wright 2006, section 16.7, gradient projection].
 
     Args:
         parameters: Tensors of one device.

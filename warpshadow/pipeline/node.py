@@ -1,10 +1,9 @@
 """Nodes: a computed value, its inputs, whether it is cached, and why.
 
 An :class:`Input` is a value from the caller, such as vertices or a light; a :class:`Node` computes one from inputs and
-nodes, when its value is asked for. An input's value never changes: another value is another input, with other nodes
-after it. So a node's value stays right for as long as the node exists. It is cached, and a node with a cached value
-asks nothing that comes before it. Not cached are values with a gradient, since a tape is good for one playback, those
-of nodes that say so (``caches``), such as samples, and all of a call that does not cache, as in the capture of a graph.
+nodes, when its value is asked for. A node computes its value once and keeps it, unless it carries a gradient (a tape is
+good for one playback), says ``caches=False``, as samples do, or the call does not cache, as in the capture of a graph.
+Inputs never change; a new value is a new input, with new nodes after it.
 """
 
 import contextlib

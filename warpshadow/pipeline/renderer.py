@@ -63,10 +63,10 @@ _OF_CAMERAS = ("_scene_view", "_catchers_alone")  # cached values of a renderer'
 class SceneRenderer:
     """Renders a scene, or instances of it with other geometry, cameras, light and reflectance.
 
-    Results that depend on the scene's own geometry and cameras alone are cached: of direct light on diffuse bodies,
-    another image by other free light then costs a dot product for each receiver, and a gather; by other reflectance the
-    gather alone. Other known light finds visibility again. Methods that return arrays are differentiable under Warp's
-    tape, in the arguments that their docstrings name.
+    Results that depend on the scene's own geometry and cameras alone are cached. In direct light on diffuse bodies
+    other free light then costs a dot product for each receiver, and a gather; other reflectance the gather alone; other
+    known light finds visibility again. Methods that return arrays are differentiable under Warp's tape, in the
+    arguments that their docstrings name.
 
     Args:
         cameras: In place of the scene's camera any number of them, of one size and near plane, whose images are a
@@ -75,7 +75,7 @@ class SceneRenderer:
             harmonics.
     Attributes:
         scene: The scene; receivers "auto" have been replaced by the chosen ones.
-        cameras: The cameras of the scene.
+        cameras: The cameras whose images it draws.
         has_camera_batch: Whether they were given as a batch.
         basis: Basis of free light.
         device: Device of its arrays.

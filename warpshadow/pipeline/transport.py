@@ -14,7 +14,7 @@ first two, by light, bounces, reflectance, and where bodies and cameras are:
 | free | some | any | given | moving patches | static patches |
 
 Cameras are the scene's where a call gives none and the renderer has one. The first two rows are
-:meth:`.Method.direct_shading`, the others :func:`choose_bouncing`. Static patches cache form factors, after which an
+:meth:`.Method.direct_shading`, the others :func:`choose_bouncing`. Static patches cache form factors, so that an
 iteration is small matrices; moving ones find all but cached visibility in each call. A shell is part of the light.
 Light of emitters is added here; the radiance that they show, and gloss, in :meth:`.View.image`.
 """
@@ -147,8 +147,8 @@ class LightTransport:
             return None
         arguments = lobes.all_points, lobes.light, materials
         bounced, openness = self.shading_without_emitters(*arguments), self._openness(*arguments)
-        own_openness = None if openness is None else lobes.points.select(openness)
-        return self.method.lobes.blocked_radiance(lobes, lobes.points.select(bounced), own_openness)
+        selected_openness = None if openness is None else lobes.points.select(openness)
+        return self.method.lobes.blocked_radiance(lobes, lobes.points.select(bounced), selected_openness)
 
     def _openness(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node | None:
         """Part of the hemispheres of points that no blocker takes, vec3 of shape [view, receiver].

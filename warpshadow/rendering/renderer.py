@@ -30,7 +30,8 @@ class Renderer(renderer.SceneRenderer):
     top, and the background is 0. :meth:`render` returns one as NumPy's array, ``draw`` a batch as Warp's.
 
     Args:
-        cameras, device, basis, progress: As there.
+        scene, cameras, device, basis: As there.
+        progress: Whether to show its progress.
     """
 
     @check.keywords(

@@ -41,10 +41,9 @@ class Body:
     """A mesh with its reflectance, placed in the world: scale first, then rotation, then translation.
 
     A point p of the mesh is at R(s p) + t. The world is right-handed with y up; a rotation turns about the origin of
-    the mesh, counter-clockwise seen from the tip of its axis. Surfaces are diffuse, or shine
-    (``roughness``). Colors are linear RGB: ``srgb_to_linear`` converts the colors that color pickers show.
-
-    A path, relative to the current folder, stands for its file, as in scene files.
+    the mesh, counter-clockwise seen from the tip of its axis. Surfaces are diffuse, or shine (``roughness``). Colors
+    are linear RGB: ``srgb_to_linear`` converts the colors that color pickers show. A path, relative to the current
+    folder, stands for its file.
 
     Args:
         mesh: The mesh, or any source that :func:`warpshadow.load_mesh` reads: a file, or a mesh or a scene of trimesh.
@@ -54,19 +53,18 @@ class Body:
             [height, width, 3], or a file that :func:`warpshadow.read_image` reads; needs uvs.
         blockers: Number of spheres to fit to the mesh, or "auto" for as many as it needs, 8 to 1024
             (:func:`warpshadow.fit_spheres`), or the spheres themselves, or an .npz file of them; 0 or none casts no
-            shadow, by rays neither. Flat bodies, and with "auto" convex pieces and cloth, may block by their own shape
-            instead: "Blockers" in scene/README.md says which. Where light bounces, a body without blockers is lit and
-            blocks no bounced light either; "Bounces" in pipeline/README.md says onto which bodies it reflects.
+            shadow, by no method. Flat bodies, and with "auto" convex pieces and cloth, may block by their own shape
+            instead ("Blockers" in scene/README.md). Bounced light passes a body without blockers, too; "Bounces" in
+            pipeline/README.md says onto which bodies it reflects.
         rotation: Axis-angle vector [degrees], shape [3]: (0, 90, 0) is a quarter turn about +y, through the origin of
-            the mesh's own space, wherever its vertices are; :meth:`on_ground` then stands the body where it is to
-            stand, and :meth:`Renderer.placed` can turn it about its middle. A matrix, shape [3, 3], becomes such a
-            vector.
+            the mesh's space, wherever its vertices are. (:meth:`on_ground` stands a body on a point;
+            :meth:`Renderer.placed` can turn it about its middle.) A matrix, shape [3, 3], becomes such a vector.
         translation: Offset [scene units], shape [3].
         scale: Factor, positive.
-        receivers: Where light is evaluated: at every "vertex", or at every "pixel" that shows the body, which a mesh
-            of few faces needs to receive a shadow; or "adaptive": on a flat body at some pixels, close to each other
-            where shadows have edges, between which it is interpolated (by pixel on other bodies, and on a GPU). "auto"
-            leaves it to each renderer, which chooses by the table of pipeline/receivers/README.md.
+        receivers: Where light is evaluated: at every "vertex"; at every "pixel" that shows the body, which a mesh of
+            few faces needs to receive a shadow; or "adaptive", on a flat body at some pixels, close to each other where
+            shadows have edges (by pixel on other bodies, and on a GPU). "auto" leaves it to each renderer, which
+            chooses by the table of pipeline/receivers/README.md.
         self_shadows: How it casts shadows on itself, as for :class:`Visibility`; None for the scene's setting.
         name: Its name for lookups, by default that of its mesh, so of the mesh's file: ``scene.bodies["cow"]``.
         shadow_catcher: Whether it models a surface in the photograph: :func:`warpshadow.insert` does not draw it, and
@@ -74,23 +72,21 @@ class Body:
             other bodies to the light without them. In the image of :func:`warpshadow.render` its shadow is coverage
             alone. ``draw``, torch's renderer, fits and the viewer show it as any other body.
         roughness: glTF's, in [0, 1], one number, one for each vertex [vertex], or a texture [height, width], which
-            needs uvs, or an .npy file of them: the surface shines by a GGX lobe of width α = roughness². None, the
-            default, is the roughness of the mesh's file, if that is glTF and neither ``albedo`` nor ``texture`` is
-            given, and else a diffuse surface. Below 0.1 it is shown as 0.1. Such a body has receivers at pixels; all
-            methods but "log-sh" show it. It reflects other bodies where light bounces; with ``bounces=0`` they are
-            black in it, so metals want bounces.
+            needs uvs, or an .npy file of them: the surface shines by a GGX lobe of width α = roughness², shown as 0.1
+            below 0.1. None, the default, is the roughness of the mesh's file, if that is glTF and neither ``albedo``
+            nor ``texture`` is given, and else a diffuse surface. Such a body has receivers at pixels; all methods but
+            "log-sh" show it. With ``bounces=0`` other bodies are black in it, so metals want bounces.
         metallic: Likewise, how much of it is metal, which reflects its albedo and has no diffuse light; by default 0.
         specular: Likewise, strength of the reflection of all but metal, of which 1, the default, is 4% straight on.
         emission: Radiance that its surface emits, linear RGB, 0 or more, for the body [3] or for each vertex
             [vertex, 3], or a texture [height, width, 3], which needs uvs, or an .npy file of it: a lamp, which lights
-            the other bodies past all that is between, from where it is, and itself if it is not convex. None, the
-            default, is no emission, or that of the mesh's file, if that is glTF and neither ``albedo`` nor ``texture``
-            is given. Open bodies emit to both sides. All methods but "log-sh" have it.
+            other bodies, and itself if it is not convex. None, the default, is no emission, or that of the mesh's file,
+            if that is glTF and neither ``albedo`` nor ``texture`` is given. Open bodies emit to both sides. All methods
+            but "log-sh" have it.
         beam: Of a body that emits, a cone in which alone it does, as a spot light: an inner and an outer angle from its
             axis [degrees], 0 ≤ inner ≤ outer ≤ 180, between which radiance falls smoothly to 0; equal ones have a sharp
-            edge, without a gradient. The axis is the mean of its normals, such as that of a disc; or, of a body that
-            faces all ways, such as a ball, −z in its own space, as in glTF. It turns with the body. None, the default,
-            is all directions.
+            edge, without a gradient. The axis turns with the body: the mean of its normals, such as that of a disc, or,
+            of a body that faces all ways, such as a ball, −z in its own space, as in glTF. None is all directions.
     """
 
     mesh: Mesh

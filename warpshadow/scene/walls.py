@@ -1,4 +1,4 @@
-"""Near light from a box: the walls of a room, as bodies that emit the radiance of a map."""
+"""Light from a box: the walls of a room, as bodies that emit the radiance of a map."""
 
 from collections.abc import Iterable
 

@@ -77,22 +77,21 @@ def fit_spheres(
 ) -> SphereFit:
     """Fit spheres to a mesh so that they cast its shadows.
 
-    The same mesh, moved or scaled, gets the same spheres, moved or scaled (up to float32 rounding). The same
-    call on the same device gives the same bits.
+    The same mesh, moved or scaled, gets the same spheres, moved or scaled (up to float32 rounding), and the same call
+    on the same device the same bits.
 
     Args:
         mesh: The mesh [scene units], y up; open and multi-part meshes, too.
         count: Number of spheres; 0 gives none. "auto" takes as many as the body needs, 8 to 1024: until the error of
             its shadows around it is some 3%, or no longer falls by 15% where they are doubled. It is 8 for a ball, 64
             for a cow, 256 for a bunny and a box, 1024 for a chair.
-        error: Instead of a count, the visibility error to reach (see FitReport), for example 0.05: the number
-            of spheres is doubled from 16 until it is met, then bisected. If 1024 do not meet it, their fit
-            comes with a warning.
+        error: Instead of a count, the visibility error to reach (see FitReport), for example 0.05: the number of
+            spheres is doubled from 16, then bisected. If 1024 do not meet it, their fit comes with a warning.
         steps: Steps of gradient descent, by which spheres that cover the mesh come to cast its shadows.
         seen_from: Direction, in the mesh's axes, to the side from which alone it is seen, as land is; its other faces
             need no spheres. Shape [3]; None for all sides.
-        cache: Read and write the fit in a cache on disk, by the mesh's shape and the arguments above. The
-            folder is the user's cache folder, or WARPSHADOW_CACHE_DIR.
+        cache: Read and write the fit in a cache on disk, by the mesh's shape and the arguments above: the user's cache
+            folder, or WARPSHADOW_CACHE_DIR.
         warns: Warn of spheres that cast a bad shadow. False where something else blocks light in their place.
     Returns:
         The spheres in the mesh's coordinates, and a report. Spheres that shrank to nothing are left out.

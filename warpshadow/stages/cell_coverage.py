@@ -2,20 +2,21 @@
 
 A cell is a disc of radius ρ around its direction ω, in the plane that touches the sphere of directions there. The plane
 through a receiver x and an edge of the outline from a to b, n = (a − x) × (b − x) towards the shape, cuts the touching
-plane in a line. Its signed distance from ω, positive where the shape is, and where along it the edge runs, from s₀ to
-s₁ within the disc, are
+plane in a line. Its signed distance d from ω is positive where ω is on the side of the shape; along it the edge runs
+from s₀ to s₁ within the disc:
 
     d = m·ω / √(1 − (m·ω)²),  m = n / |n|,  s = (a − x)·t / (a − x)·ω,  t = ω × m / |ω × m|
 
-and the area of the disc inside the outline is that of the whole disc, as often as the outline winds around ω, and a
-term for each edge that crosses the disc, the area between the edge and the disc's border:
+The area of the disc inside the outline is that of the whole disc, as often as the outline winds around ω, and for each
+edge the area between the edge and the disc's border:
 
     π ρ² h = π ρ² w + ½ Σ_edges d (s₁ − s₀) − ρ² sign(d) atan2(|d| (s₁ − s₀), d² + s₀ s₁)
 
-The angles together are that of the product of complex numbers d² + s₀ s₁ − i d (s₁ − s₀), and a turn each time that it
+The angles add up to that of the product of complex numbers d² + s₀ s₁ − i d (s₁ − s₀), and a turn each time that it
 crosses the negative axis: one arc tangent for a cell, not one for an edge, which takes 12 to 20% less time.
 
-Where in the cell the shape is, its first moment says, by Green's theorem, with n̂ the unit vector from the line to ω:
+The first moment says where in the cell the shape is. By Green's theorem, with n̂ the unit vector across the line,
+towards the shape:
 
     π ρ³ μ = ∫ y dA = ⅓ Σ_edges (s₁ − s₀) ((ρ² − d²) n̂ + ½ d (s₀ + s₁) t)
 
@@ -23,8 +24,7 @@ As a line moves by δ(s), the area grows by ∫ δ ds between s₀ and s₁, and
 
     y = −d n̂ + s t,  δ = ∂n·(ω + y) / (|n| √(1 − (m·ω)²))
 
-Where a corner is nearer to ω than some 1e-6, rounding decides how its edges
-share the disc. Shapes that meet at an edge share the cells there without a remainder: edges are exact.
+Shapes that meet at an edge share cells there without a remainder; within 1e-6 of a corner rounding decides.
 """
 
 import warp as wp

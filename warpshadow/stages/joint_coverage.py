@@ -1,13 +1,13 @@
 """Joint coverage: the share of a cell of directions that several blockers leave open, and where.
 
 Of each blocker the share h that it covers is known, and its first moment μ (:mod:`warpshadow.stages.cell_coverage`),
-but not the part that two of them cover both. If they are independent of each other; beside each other, as a roof and
-the wall under it; or behind each other, as a car on a ground,
+but not the part that two of them cover both. If they are independent; beside each other, as a roof and the wall under
+it; or behind each other, as a car on a ground, there is open
 
     Π (1 − h)        max(0, 1 − Σ h)        1 − max h
 
-is open. Moments tell: of blockers beside each other they point away from each other, of blockers behind each other in
-the same direction. With ν(h) the moment of a half-plane that covers h, which is the longest that there is,
+Moments tell which: of blockers beside each other they point apart, of blockers behind each other the same way. With
+ν(h) the moment of a half-plane that covers h, the longest that there is,
 
     k = Σ_{i≠j} μ_i·μ_j / Σ_{i≠j} ν(h_i) ν(h_j)
     T = (1 − |k|) Π (1 − h) + |k| (max(0, 1 − Σ h) where k < 0, else 1 − max h)

@@ -1,13 +1,13 @@
 """Patches: the parts of a body's surface that send light as one, and the patch samples at which they are lit.
 
 Faces are cut at their longest edges into pieces of about one size, and patches are clusters of pieces by position and
-normal (k-means): 256 at most, of 8 pieces or more. They are smaller where the body touches another
+normal (k-means): 256 at most, of 8 pieces or more, smaller where the body touches another
 (:mod:`warpshadow.maths.contacts`). A body that lies in a plane has a grid of texels instead, which are small near the
 other bodies, whose shadows it shows (:mod:`warpshadow.stages.planes.grid`). A patch has up to four patch samples, with
 weights by area. Pieces inside another part of the body belong to no patch.
 
-All is found once, in the body's own frame and at rest; patches move with the body. The patches of an open surface's
-backs follow those of its fronts.
+All is found once, in the body's own frame and at rest; patches move with the body. Patches of backs follow those of
+fronts.
 """
 
 from collections.abc import Callable, Sequence
@@ -133,8 +133,7 @@ def find_patches(
     piece that is mostly inside, and reaches out, sends the light of the nearest patch, whose area does not count it.
 
     Args:
-        positions: Vertices [units of the body], shape [vertex, 3].
-        faces: Faces that wind alike, shape [face, 3].
+        positions, faces: Vertices [units of the body], shape [vertex, 3], and faces that wind alike, [face, 3].
         is_two_sided: Whether the backs of faces send light, too: each side then has half of the patches.
         count: Number of patches, at most.
         patch_samples: Number of patch samples of each, at most.
@@ -285,8 +284,7 @@ def _cut_faces(
     """Halve faces across their longest edges, until none is longer than 1.
 
     Args:
-        positions: Vertices [units of the body], shape [vertex, 3].
-        faces: Faces, shape [face, 3].
+        positions, faces: Vertices [units of the body], shape [vertex, 3], and faces, [face, 3].
         to_unit_lengths: Maps points [..., 3] to the space in which lengths count.
     """
     face_corners = positions.astype(np.float64)[faces]

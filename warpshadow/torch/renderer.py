@@ -111,12 +111,6 @@ class TorchRenderer(torch.nn.Module):
         self.array_renderer = Renderer(scene, cameras=cameras, device=str(device), basis=basis, progress=progress)
 
     @property
-    def warp(self) -> Renderer:
-        """The former name of :attr:`array_renderer`."""
-        check.warn("TorchRenderer.warp: it is called array_renderer from now on", DeprecationWarning)
-        return self.array_renderer
-
-    @property
     def scene(self) -> Scene:
         """The scene; a method "auto" has been replaced by the chosen one."""
         return self.array_renderer.scene
@@ -127,7 +121,7 @@ class TorchRenderer(torch.nn.Module):
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """The scene's cameras."""
+        """The cameras whose images a call makes: ``cameras``, or the scene's."""
         return self.array_renderer.cameras
 
     @property

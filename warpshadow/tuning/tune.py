@@ -203,10 +203,9 @@ def tune(
 ) -> Tuning:
     """Measure settings of a scene, and choose the cheapest that reaches an error, or the best within a time.
 
-    Tried are all methods but rays, as far as they show all that the scene has; 32 to 512 directions, where bodies shine
-    no fewer than by default; orders 4, 6 and 8;
-    16 to 512 spheres for bodies that say how many; and every pixel as a receiver for bodies whose vertices miss
-    shadows.
+    Tried are all methods but rays that show all that the scene has; 32 to 512 directions, where bodies shine no fewer
+    than by default; orders 4, 6 and 8; 16 to 512 spheres for bodies that say how many; and every pixel as a receiver
+    for bodies whose vertices miss shadows.
 
     Args:
         scene: The scene; its "auto" is not looked at.
@@ -214,8 +213,8 @@ def tune(
         milliseconds: In place of an error the longest time of an image.
         bounces: How often light bounces in the reference, such as 12 or "all": then 0, 1, 2 and 4 bounces are tried,
             too, as far as there are so many, and "all". By default the scene's, which are not varied.
-        fits: Whether to fit as many spheres as are tried, which takes some 20 s a body. Otherwise only the scene's own
-            number is, and others where fits are cached already.
+        fits: Whether to fit as many spheres as are tried, some 20 s a body; otherwise only the scene's own number is
+            tried, and others whose fits are cached already.
         progress: Show progress, and all errors before anything is timed.
     Returns:
         The choice, and all trials. If no setting reaches the target, it is the nearest. Settings that miss an error are

@@ -333,13 +333,13 @@ def test_what_was_traced_at_an_interrupt_is_not_traced_again(tmp_path, monkeypat
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt, match="^192 of 642 points of the self-"):
         patch.setattr(progress, "Wait", Interrupting)
         rows()
-    (part,) = cached_files("own_shadows")
+    (part,) = cached_files("self_shadows")
     assert part.name.endswith(".part.npz")
     blocks.clear()
     for array, other in zip(rows(), whole, strict=True):
         np.testing.assert_array_equal(array, other)
     assert blocks == all_blocks[3:]
-    (cached,) = cached_files("own_shadows")
+    (cached,) = cached_files("self_shadows")
     assert cached.name == part.name.replace(".part", "")
     blocks.clear()
     rows()
@@ -348,11 +348,11 @@ def test_what_was_traced_at_an_interrupt_is_not_traced_again(tmp_path, monkeypat
 
 def test_a_damaged_file_of_an_interrupt_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
-    path = cache_path("own_shadows", "0" * 64)
+    path = cache_path("self_shadows", "0" * 64)
     path.parent.mkdir()
     path.with_suffix(".part.npz").write_bytes(b"PK damaged")
     found = load_or_compute(path, dict, lambda unfinished: dict(unfinished.before), lambda made: made, noun="thing")
-    assert found == {} and cached_files("own_shadows") == [path]
+    assert found == {} and cached_files("self_shadows") == [path]
 
 
 def test_rows_that_take_long_to_trace_are_announced_with_the_way_around_them(tmp_path, monkeypatch, capsys):

@@ -379,7 +379,7 @@ def test_orders_without_kernels_are_refused(order, device):
 
 
 def test_log_visibility_of_no_order_is_refused(device):
-    with pytest.raises(ValueError, match=r"log_sh: got shape \(1, 1, 60\), expected \[batch, vertex, 64\]"):
+    with pytest.raises(ValueError, match=r"log_sh: got shape \(1, 1, 60\), expected \[batch, receiver, 64\]"):
         exponentiate(np.zeros((1, 60)), device)
 
 

@@ -1,8 +1,8 @@
 """Convex blockers of a scene: bodies that consist of convex parts, such as boxes, rods and panels of cloth.
 
-Spheres bulge out of flat sides and thin boards, and light comes between them. Instead, the share of a cell of
-directions that each part covers is computed. The parts of solids block their own light, too; panels are chords of bent
-cloth, in which its receivers do not lie, so sheets cast shadows on themselves found by rays.
+The share of a cell of directions that each part covers is computed: spheres would bulge out of flat sides and thin
+boards, with light between them. The parts of solids block their own light, too. Sheets' self-shadows come from rays:
+panels are chords of bent cloth, in which its receivers do not lie.
 """
 
 import functools

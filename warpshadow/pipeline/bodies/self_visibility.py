@@ -121,7 +121,7 @@ class SelfVisibility:
         self._rows: dict[int, VisibilityRows] = {}
         self._lobes: dict[tuple[int, int], wp.array] = {}
 
-    # ------------------------------------------------------------------------------------------ which bodies
+    # ----------------------------------------------------------------------------------- kind of self-shadow
 
     def why_spheres(self, body: int, geometry: Geometry | None) -> str:
         """Why a body's own spheres block its light in a geometry, by default the scene's; empty if they do not."""
@@ -150,7 +150,7 @@ class SelfVisibility:
         scene = self._merged_scene.scene
         return scene.bodies[body].self_shadows_in(scene.visibility)
 
-    # ------------------------------------------------------------------------------------------ where
+    # ----------------------------------------------------------------------------------------- probes
 
     def probes(self, body: int) -> VisibilityProbes:
         """The probes of a body, in the frame of its fit."""
@@ -209,7 +209,7 @@ class SelfVisibility:
             )
         return self._tables[body]
 
-    # ------------------------------------------------------------------------------------------ which
+    # ----------------------------------------------------------------------------- tables and lookups
 
     def lookups(
         self,
@@ -326,7 +326,7 @@ class SelfVisibility:
         key = hashlib.sha256(json.dumps(numbers).encode())
         key.update(probes.positions.tobytes())
         key.update(np.asarray(mesh.surface.faces, np.int32).tobytes())
-        return cache_path("own_shadows", key.hexdigest())
+        return cache_path("self_shadows", key.hexdigest())
 
     def _find_rows(self, body: int) -> VisibilityRows:
         mesh, device = self._merged_scene.scene.bodies[body].mesh, self._merged_scene.device

@@ -4,14 +4,12 @@ Patches have a radiosity B, reflected from direct light S and bounced light I:
 
     B = a (S + I),   I = G[B]
 
-G is applied as often as light bounces: first at the patch samples, points where patches are lit, at last at the
-receivers of the image. It has three parts, each a stage of its own: light from a body's own patches, from plane bodies,
-and from the proxies of other bodies. The blocked part of a cell sends light of one of the three alone, so that none
-counts twice.
+G is applied as often as light bounces: first at patch samples, at last at the receivers of the image. It is a sum of
+three stages: light from a body's own patches, from plane bodies, and from the proxies of other bodies. None counts
+twice: the blocked part of a cell sends light of one of them alone.
 
-Between patches of one body the first part is a small matrix that does not change. Within a body light goes on for
-``SELF_BOUNCES`` more bounces, since hollow bodies hold it long: after the last bounce between bodies; with bounces
-"all" after each of them.
+The first is a small matrix that does not change. Hollow bodies hold light long, so it is applied ``SELF_BOUNCES`` more
+times: after the last bounce between bodies; with bounces "all" after each of them.
 """
 
 import functools

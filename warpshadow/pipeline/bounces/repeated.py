@@ -27,10 +27,9 @@ def after_bounces(
 
     Args:
         bounces: How often light bounces.
-        by_others: Function of the radiosity B, None before the first bounce: the light of patches that is not from
-            their own body, so from the sky and from other bodies. Only ``add_by_self`` reads its result.
-        add_by_self: Function of that light and of B: adds the light from their own body, none for None, and returns the
-            next radiosity.
+        by_others: radiosity B → irradiance of patches from the sky and, unless B is None, from other bodies.
+        add_by_self: (that irradiance, B) → the next radiosity, with light from patches of the same body added, unless B
+            is None.
         areas: Of patches, shape [patch].
         self_bounces: How often ``add_by_self`` alone is repeated after the last bounce, or after each of "all"; 0 where
             bodies send themselves no light.

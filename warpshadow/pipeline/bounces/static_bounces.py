@@ -1,16 +1,15 @@
 """Bounces between static patches: rays once for a geometry, then small matrices for each light and reflectance.
 
-Rays find the form factors F from patches to patch samples, the points at which patches are lit, and to receivers, once
-(:mod:`.static_form_factors`). With direct shading S and albedo a an iteration finds the radiosity of patches after
-n − 1 bounces, or after all,
+Rays find the form factors F from patches to patch samples and to receivers, once (:mod:`.static_form_factors`). With
+direct shading S and albedo a an iteration finds the radiosity of patches after n − 1 bounces, or after all,
 
     B = a (M S + M F B),  M the mean over patch samples outside of other bodies,        starting from B = a M S,
 
-and receivers gather F B. Light that a body sends to itself may go on for longer than that. Receivers of an image are
-many: F is found at some of them, and interpolated.
+and receivers gather F B. Light within one body may bounce more often than that. Receivers of an image are many: F is
+found at some of them, and interpolated.
 
-The radiosity is linear in light: of free light among bodies whose colors are known all of it is one matrix, which is
-cached. Differentiable in light and albedo.
+The radiosity is linear in light: of free light among bodies of known colors it is one matrix, which is cached.
+Differentiable in light and albedo.
 """
 
 from __future__ import annotations

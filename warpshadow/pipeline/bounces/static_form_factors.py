@@ -1,12 +1,11 @@
 """Form factors between static patches, and from them to receivers: by rays, once for a geometry.
 
-Two methods say how open a point is: spheres, past which its direct light comes, leave the share s of the hemisphere
-open; rays, which find F, hit bodies in the share f. As s + f need not be 1, F of a point is scaled by (1 − s) / f.
-Otherwise light is gained and lost: eighteen white balls in a white furnace were 0.91 to 1.06 bright.
+Form factors F of a point are scaled so that they sum to 1 − s. Direct light and form factors estimate the same openness
+by different means: spheres leave the share s of the hemisphere open, rays hit bodies in the share f. Unscaled they lose
+and gain energy: eighteen white balls in a white furnace were 0.91 to 1.06 bright.
 
-Points inside another body see its inside; they count neither in means over patch samples nor as cache points. Where all
-patch samples of a patch are inside, a part of the patch between them may be seen: it has the light of the nearest patch
-of its body.
+Points inside another body count neither in means over patch samples nor as cache points: they see its inside. A patch
+whose samples are all inside has the light of the nearest patch of its body, as a part between them may be seen.
 """
 
 from __future__ import annotations

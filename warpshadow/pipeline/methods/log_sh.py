@@ -25,7 +25,7 @@ from warpshadow.stages.visibility import exponential, log_sh
 
 
 class ProjectedBands(NamedTuple):
-    """Light in bands of spherical harmonics; or in cells of a shell, which the method "none" has."""
+    """Light in bands of spherical harmonics; of the method "none", derived from this one, also in cells of a shell."""
 
     bands: int  # 0 of cells of a shell
     coefficients: wp.array | None = None  # of known light, vec3 of shape [1, bands²], or [1, patch]

@@ -1,8 +1,8 @@
 """Buried vertices: corners of visible faces that lie inside another body, as below a box, or behind a plane.
 
-They are dark, and pixels beside the other body would interpolate between them and vertices in the open: a dark line one
-pixel high along the toe of a wedge, 0.58 of the light there, which is too little of the ground to count as uneven. The
-ground at the foot of a wall that stands on it has such a line, too, and a ball where it sinks into a ground.
+They are dark, and pixels beside the other body would interpolate between them and vertices in the open: a dark line
+along the toe of a wedge, at the foot of a wall on a ground, or of a ball that sinks into it. Such a line, one pixel
+high with 0.58 of the light, is too little of a ground to count as uneven.
 """
 
 from collections.abc import Sequence

@@ -1,12 +1,11 @@
 """The choice of receivers, by the table of README.md beside this file.
 
-Flat bodies are adaptive (:mod:`.receivers.adaptive`) where shadows may have edges, and where arrays are readable, on a
-CPU: a ground has about the error that it has by pixel, in less time. Where a renderer has a basis, light is free, and
-nobody knows where edges will be.
+Flat bodies are adaptive (:mod:`.receivers.adaptive`) where shadows may have edges: of known light, and where arrays are
+readable, on a CPU. A ground then has about the error that it has by pixel, in less time.
 
 Between vertices light is interpolated, which shows where a face is large, or small and long, as spokes and rails are;
-so faces count by their pixels and by their longest edges. A picture that is made once can afford per-pixel receivers on
-its grounds and walls, where shadows' edges show most.
+so faces count by their pixels and by their longest edges. A still can afford receivers at the pixels of its grounds and
+walls, where shadows' edges show most.
 """
 
 import dataclasses
@@ -33,43 +32,26 @@ from warpshadow.stages.raster.rasterization import rasterize
 from warpshadow.stages.visibility.sharp_cells import find_sharp_cells
 
 LARGE_FACE = 16.0
-"""Pixels of an average face beyond which a body is shaded by pixel, in images of up to 256 × 256 pixels: a ground of
-32² quads under a sky with a sun (34 pixels a face) is 5.8% off at vertices, by pixel 2.9% in 3.5 times the time; one of
-64² quads (9 pixels) 4.0%, and 2.9% in 4 times the time …"""
+"""Pixels of an average face beyond which a body is shaded by pixel, in images of up to 256 × 256 pixels. README.md
+beside this file has the measurements of this constant and of those below."""
 
-LARGE_SHARE = 2.0**-12
-"""… and in larger images its share of them, since cost grows with pixels and the error of interpolation does not …"""
+LARGE_SHARE = 2.0**-12  # in larger images, their share of the pixels: cost grows with pixels, the error does not …
 
 COARSE_FACE = 400.0  # … up to so many pixels: beyond, interpolation shows, and draws a warning if the user asked for it
 
-SMALL_FACE = 2.0
-"""Pixels of an average face up to which the vertices of a flat body are as close as shadows need, unless light is off
-by :data:`UNEVEN` between them; in a small image an edge is as sharp there (a ground of 64² quads in 64² pixels is 0.9%
-off its image by pixel, adaptive 1.1%). Thin things need more: on grounds whose faces have 2.7 to 2.9 pixels, in 128²
-pixels, adaptive receivers took the errors of the chair, wheel and fence of demos/kinds.py from 7.3 to 5.5%, of the tent
-from 6.5 to 3.7% and of the cage from 9.3 to 8.7%, in 1.1 to 1.2 times the time.
-"""
+SMALL_FACE = 2.0  # pixels of an average face beyond which a flat body is adaptive, since vertices are too far apart
 
 FEW_FACES = 256
 """Faces up to which a body is shaded by pixel wherever one has a pixel or more: on a box with a vertex at every corner
-a shadow on a side is seen at its ends or not at all, and few faces of few pixels cost little. In a city of sixty boxes
-and cylinders of 100 pixels each the worst one was 33% too dark at vertices, and the image off by 11.2% in place of 7.0%
-(0.54 s of CPU time for an image of moved bodies, and 0.66 s)."""
+a shadow on a side is seen at its ends or not at all, and few faces of few pixels cost little."""
 
 UNEVEN = 0.06
 """Error of light that is interpolated between vertices, relative L2, from which a body is shaded by pixel, or a flat
-one adaptively. Renderers' images of demos/kinds.py, 128² pixels, direct light, are off at vertices, and by pixel, where
-that error is 25% (a stone in a pile) by 2.9 and 1.8%; 19% (a small bear) 3.7 and 2.2%; 18% (a bracket) 2.9 and 1.9%;
-12% (a bear in a bowl) 3.1 and 2.6%; 7% (dunes) 5.5 and 4.0%; 4% (a bowl) 2.6 and 2.6%, in 1.15 to 2.2 times the time.
-Grounds that are adaptive by it: under slats 6.3 and 2.0%, of the city 6.4 and 2.3%. Smooth bodies alone on a ground
-have 2 to 4%.
-"""
+one adaptively. Smooth bodies alone on a ground have 2 to 4%."""
 
 UNEVEN_SHARE = 0.25
 """From this part of the largest area (:data:`LARGE_FACE`, :data:`LARGE_SHARE`) on, :data:`UNEVEN` is multiplied by
-√(UNEVEN_SHARE · largest / area), which is ½ at the largest: teeth of a shadow's edge are as long as the side of a face.
-A bowl with an egg in it, 192² pixels (7.2 pixels a face; 6%), is 4.9% off at vertices, 2.8% by pixel, in 2.1 times the
-time."""
+√(UNEVEN_SHARE · largest / area), which is ½ at the largest: teeth of a shadow's edge are as long as a face's side."""
 
 _LONG_SHARE = 0.05
 """Share of a body's pixels that its longest faces show: in 256² pixels such faces are longer than 8 to 12 pixels on
@@ -182,9 +164,7 @@ def for_picture(scene: Scene) -> Scene:
 
     Interpolation between the vertices of a ground makes shadows' edges jagged. Under a sun all other bodies are shaded
     by pixel, too, and ``self_shadows`` "traced" becomes "rays", which have no gradient: of a still nobody asks for one.
-    Edges are as clean as of ``ray-traced``. At 768 × 768 pixels, under a sun of 1° radius, at vertices, by pixel, and
-    by pixel with rays, the cow of 2930 vertices is 3.4, 2.0 and 1.2% off (0.13, 0.31 and 0.35 s), a bear of 1986
-    vertices 7.3, 3.6 and 1.9% (0.11, 0.20 and 0.34 s).
+    Edges are as clean as of ``ray-traced``: README.md beside this file has errors and times.
     """
     if scene.visibility.method is None:
         if not any(isinstance(body.blockers, Spheres) or body.self_shadows for body in scene.bodies):

@@ -141,9 +141,9 @@ class Group:
         return find_fronts(*arguments, body=body, skip=skip)
 
     def portions(self) -> Iterator[Group]:
-        """Portions of the receivers, with as many instances in all arrays where anything blocks.
+        """Portions of the receivers; all of them at once for a gradient, and where they have cached rows.
 
-        For a gradient all of them come at once, and so do receivers with cached rows.
+        All arrays of a portion have the same batch, if anything blocks.
         """
         body, planes, clusters = self.receiver_body, self.planes, self.clusters
         rotation_data = None if body is None or body.lookup is None else body.lookup.turned
@@ -193,16 +193,22 @@ class HarmonicVisibility(NamedTuple):
 
 
 class CellVisibility(NamedTuple):
-    """Visibility of a group in cells of directions: transmittances, float32 of shape [batch, receiver, cell]."""
+    """Visibility of a group in cells of directions: transmittances, float32 of shape [batch, receiver, cell].
+
+    | transmittance | past | None |
+    | --- | --- | --- |
+    | ``_total`` | all bodies; before ``find_visibility_past_planes`` all but planes | before, without bounces |
+    | ``_self`` | the receivers' body | where it is 1 |
+    | ``_nonplanar`` | all bodies but planes | where no planes block, or light does not bounce |
+    | ``_self_and_spheres`` | the receivers' body, and spheres | where it is 1 |
+    """
 
     directions: np.ndarray  # of the cells, [cell, 3]
-    # after find_visibility past all but planes, None if planes follow and light does not bounce; then past all bodies
     transmittance_total: wp.array | None
-    transmittance_self: wp.array | None = None  # a factor of it: transmittance past its own body; None where that is 1
-    transmittance_nonplanar: wp.array | None = None  # past all but planes; None where no planes block, or nobody asks
-    # transmittance past its own body and spheres, without convex parts and planes; None where that is 1
+    transmittance_self: wp.array | None = None
+    transmittance_nonplanar: wp.array | None = None
     transmittance_self_and_spheres: wp.array | None = None
-    part_coverages: CellCoverages | None = None  # coverage by convex parts; None where there are none around
+    part_coverages: CellCoverages | None = None  # by convex parts; None without any around
 
 
 class Blockers(NamedTuple):

@@ -25,7 +25,7 @@ class SceneReceivers:
         self._merged_scene, scene = merged_scene, merged_scene.scene
         self._sends_light = bool(scene.bounces or merged_scene.is_emitter.any())
         self.at_all_samples = scene.visibility.traits.every_sample_receives
-        # probes look at the brightest cells of the map, which tell nothing of the shadows of near light
+        # probes look at the brightest cells of the map, which tell nothing of lamps, or of light from a shell
         is_far = not (self.at_all_samples or merged_scene.is_emitter.any() or scene.shell is not None)
         self.is_adaptive = np.array([body.receivers == "adaptive" for body in scene.bodies])
         self.is_adaptive &= merged_scene.is_flat & is_far

@@ -68,7 +68,7 @@ ONLY_SPHERES = BlockerKinds()  # all bodies block by their spheres
 class ShadingContext:
     """Receivers, such as those of a view, and all that their shading depends on but the light and the method.
 
-    Bodies in their poses, materials, and values that are cached. PBRT calls such records contexts.
+    PBRT calls such records contexts.
 
     Args:
         merged_scene: The bodies among which they are.

@@ -1,12 +1,11 @@
 """Static bodies: bodies that do not move while others do. Results about them are computed once and cached.
 
-Where the spheres of moving bodies let the share T_q of the light of a cell through, a receiver on a static body gets
+Where moving spheres let the share T_q of the light of a cell through, a receiver on a static body gets
 
     B = Σ_q T_q S_q,  S_q = ∫_{cell q} L(ω) V(ω) max(n·ω, 0) dω / π,
 
-V the visibility past the meshes of the static bodies. S does not change, so rays find it, as many as ``samples`` says:
-shadows of static bodies on static ones are those of their meshes. In log-SH space the sum over the spheres of the
-static bodies does not change.
+V the visibility past the meshes of the static bodies, by as many rays as ``samples`` says. S does not change. In log-SH
+space the sum over the spheres of the static bodies does not.
 """
 
 import functools

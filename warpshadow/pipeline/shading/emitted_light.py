@@ -106,7 +106,7 @@ def _find_transmittances(
 ) -> Iterator[tuple[EmitterSpan, wp.array | None]]:
     """Samples of all emitters that light a portion of receivers, and the transmittance to them.
 
-    An emitter lights itself, too, unless it hides nothing of itself: then no part of it faces another.
+    An emitter also lights itself, if it is not convex.
     """
     merged_scene, points, normals = blockers.merged_scene, group.points, group.normals
     if not points.size:
@@ -119,22 +119,22 @@ def _find_transmittances(
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
     spheres = merged_scene.spheres_of(sphere_bodies, blockers.spheres)
     traced_body = group.body if group.body in blockers.blocker_kinds.self_traced else None
-    own_spheres = merged_scene.spheres_among(sphere_bodies, traced_body)
+    self_spheres = merged_scene.spheres_among(sphere_bodies, traced_body)
 
     @functools.cache
-    def own_meshes() -> list[wp.Mesh | None]:
+    def self_meshes() -> list[wp.Mesh | None]:
         """The receivers' own body in each geometry, for all emitters within it."""
-        own = () if group.body is None else (group.body,)
+        bodies = () if group.body is None else (group.body,)
         positions = blockers.positions
-        return [merged_scene.casting_mesh(positions[geometry], own) for geometry in range(len(positions))]
+        return [merged_scene.casting_mesh(positions[geometry], bodies) for geometry in range(len(positions))]
 
     for body, span, hidden_by_itself in zip(emitters.bodies, emitters.spans(), self_visibility, strict=True):
-        is_own = body == group.body
-        if is_own and hidden_by_itself is None:
+        is_on_emitter = body == group.body
+        if is_on_emitter and hidden_by_itself is None:
             continue
-        skipped = own_spheres, merged_scene.spheres_among(sphere_bodies, body)
+        skipped = self_spheres, merged_scene.spheres_among(sphere_bodies, body)
         transmittance_self = None
-        if transmittance_of_cells is not None and not is_own:
+        if transmittance_of_cells is not None and not is_on_emitter:
             is_within = _find_where_enclosed(blockers, body, group.body)
             if not is_within.all():
                 directions = find_directions_to_samples(points, placed_samples, span)
@@ -144,13 +144,13 @@ def _find_transmittances(
             if is_within.any():
                 # cells tell whether rays leave the body: a bulb in a shade would be hidden by the shade's far side
                 with unrecorded():
-                    arguments = own_meshes(), points, normals, emitters, blockers.positions, placed_samples, span
+                    arguments = self_meshes(), points, normals, emitters, blockers.positions, placed_samples, span
                     traced = trace_transmittances(*arguments, rays=1)
                 transmittance_self = replace_instances(transmittance_self, traced, is_within)
         transmittance_of_emitter = None
         if hidden_by_itself is not None:
             lookup = points, placed_samples, span, hidden_by_itself
-            transmittance_of_emitter = look_up_self_visibility(*lookup, is_own=is_own)
+            transmittance_of_emitter = look_up_self_visibility(*lookup, is_on_emitter=is_on_emitter)
         yield (
             span,
             find_transmittance_to_samples(

@@ -47,7 +47,7 @@ class ProjectedLight(Protocol):
 class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     """A method in which spheres stand in for the bodies: visibility, transfer vectors, and shading.
 
-    Its two types say in which basis it has light, and visibility. A method gives these members, besides those of
+    Its two types are those of light and of visibility in its basis. A method gives these members, besides those of
     :class:`.Method` for bodies that shine:
 
     | member | needed for | default |
@@ -243,9 +243,10 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         return ShadingNode(self, points, Node("", self.project_light, sky), sky, suffix=" in an even sky")
 
     def transfers(self, points: ShadingContext, shell: Input | None) -> Node:
-        """Transfer vectors of points to :attr:`basis`; where they require a gradient, to the method's native basis.
+        """Transfer vectors of points: to the native basis if they require a gradient, else to :attr:`basis`.
 
-        The product with the matrix between both is NumPy's; :meth:`_free_shading` converts the light instead.
+        NumPy, which has no gradient, multiplies them by the matrix between both; with one, :meth:`_free_shading`
+        converts the light instead.
         """
         matrix, visibility_light = self.native_from_basis, self.free_basis_of(points, shell)
         transfers = TransferNode(self, points, visibility_light, None, caches=matrix is None)

@@ -44,12 +44,9 @@ class View(ShadingContext):
         vertices: Positions of all vertices.
         spheres: Centers and radii of the spheres.
         cameras: Clip matrices.
-        static_bodies: Those among moving ones; None where any may move.
-        blocker_kinds: Which bodies block light by something else than their spheres.
-        call: Holds its values that may not be cached.
+        static_bodies, blocker_kinds, call, is_scene_view: As for :class:`ShadingContext`.
         camera: Has the cameras' size and near plane.
         counts: Number of geometries, and of images.
-        is_scene_view: As for :class:`ShadingContext`.
     Attributes:
         dependencies: Vertices, spheres, cameras, static bodies, and how all block light.
         clip_positions, fragments_node, silhouettes, receivers_node: Nodes of the visible surfaces.

@@ -19,9 +19,7 @@ def mean_over_vertices(patches: Patches, positions: np.ndarray, faces: np.ndarra
     """The matrix of means over patches of an attribute that is interpolated between vertices.
 
     Args:
-        patches: Of a body.
-        positions: Its vertices [units of the body], shape [vertex, 3].
-        faces: Its faces, shape [face, 3].
+        positions, faces: Vertices [units of the body], shape [vertex, 3], and faces, [face, 3].
     Returns:
         Shape [patch, vertex]; rows sum to 1, rows of patches without an area are empty.
     """
@@ -43,9 +41,7 @@ def mean_over_texels(
     A piece of a patch takes the mip level whose texels are about as large as it, in its middle, bilinearly.
 
     Args:
-        patches: Of a body.
-        positions: Its vertices [units of the body], shape [vertex, 3].
-        faces: Its faces, shape [face, 3].
+        positions, faces: Vertices [units of the body], shape [vertex, 3], and faces, [face, 3].
         uvs: Texture coordinates, shape [uv, 2].
         uv_faces: Indices of them, shape [face, 3].
         size: Height and width of the texture.

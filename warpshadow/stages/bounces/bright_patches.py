@@ -1,13 +1,13 @@
 """Bright patches: the few that most light comes from, as those in a lampshade. Rays are sent to them on purpose.
 
-Rays that are as dense as the cosine find small patches by chance. To the N of these M are added, to points of bright
-patches drawn in proportion to radiosity and area, so with a density q by area. The rays of both kinds that meet a point
-of a bright patch count alike, by the balance heuristic:
+Rays that are as dense as the cosine find small patches by chance. To N of these, M are added to points of bright
+patches, drawn in proportion to radiosity and area, with a density q by area. Rays of both kinds count alike, by the
+balance heuristic:
 
     F_xp = Σ g / (N g + q),   g = V max(n·ω, 0) |m·ω| / (π d²)        [Veach & Guibas 1995, "Optimally Combining
                                                                        Sampling Techniques for Monte Carlo Rendering"]
 
-m the normal of the patch and d the distance; of another patch q is 0, and each ray counts 1 / N.
+m is the normal of the patch, d the distance; of a patch that is not bright q is 0, and each ray counts 1 / N.
 """
 
 import numpy as np

@@ -2,7 +2,7 @@
 
     I_x = Σ_k T_xk ∘ L_k      for red, green and blue
 
-since bodies reflect colors, T has three of them where transfer vectors of direct light have one number.
+Bodies reflect colors, so T has three numbers where transfer vectors of direct light have one.
 """
 
 from __future__ import annotations
@@ -72,7 +72,6 @@ def colored_light(transfer: ColoredTransfer, light: wp.array) -> wp.array:
     """Light receivers by coefficients.
 
     Args:
-        transfer: Of the receivers.
         light: Coefficients of the light, linear RGB, vec3 of shape [batch, coefficient].
     Returns:
         vec3 of shape [batch, receiver].

@@ -129,7 +129,6 @@ def patch_mesh(patches: Patches, positions: np.ndarray, faces: np.ndarray, *, de
     """Make the mesh of the pieces of a body, for rays: its face is a piece.
 
     Args:
-        patches: Has the pieces.
         positions, faces: The mesh that they are pieces of, NumPy.
     """
     return loose_mesh(patches.pieces.positions(positions, faces), device=device)
@@ -164,19 +163,16 @@ def trace_form_factors(
         F_xp = 1/π ∫ [x sees p towards ω] max(n·ω, 0) dω
 
     so that Σ_p F_xp B_p is the light that x, if white, reflects of the radiosity B of patches. Rays are as dense as the
-    cosine, on a lattice that is turned at random for each receiver; an F has a standard error of at most
-    √(F (1 − F) / rays), and less, since a lattice is even.
+    cosine, on a lattice that is turned at random for each receiver: F has a standard error below √(F (1 − F) / rays).
 
     Args:
         mesh: The mesh for rays; :func:`patch_mesh` makes it of a body.
         patch_of_sides: Patch of the front and the back of each of its faces, −1 for black, shape [2, face].
-        count: Number of patches.
         points: Receivers, which may lie on the mesh, shape [receiver, 3].
         normals: Unit normals, shape [receiver, 3]. Where one is zero nothing is seen.
         rays: Rays of each receiver in all directions, a multiple of 16.
         bright: Patches of the mesh that more rays are sent to; None for none.
         tree: Hierarchy of its faces, of :func:`build_loose_tree`; None for one that is built for this call.
-        progress: Print how far it is.
     Returns:
         F, float32 of shape [receiver, patch].
     Differentiable: no.

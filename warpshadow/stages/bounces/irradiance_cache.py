@@ -44,8 +44,7 @@ def interpolation_matrix(points: np.ndarray, normals: np.ndarray, cache_points: 
     With d_i the distances to the nearest cache points in order, the three nearest weigh (1/d_i − 1/d_4)² [Renka 1988].
 
     Args:
-        points: Receivers, shape [receiver, 3].
-        normals: Their unit normals, shape [receiver, 3].
+        points, normals: Receivers and their unit normals, shape [receiver, 3].
         cache_points: Which of them are cache points, shape [cache point].
     Returns:
         Shape [receiver, cache point]; rows sum to 1.

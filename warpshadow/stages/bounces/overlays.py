@@ -2,10 +2,10 @@
 
     B′_p = B_p + c_p (Σ_t k_pt B_t − B_p),  c_p = S(3 − 2 |x_p − Σ_t k_pt x_t| / d_p)
 
-of a patch p that is covered by texels t of a plane with weights k: x_p is the center of its proxy, and d_p, at least
-its radius, its distance from these texels in the scene as given; S is the smoothstep from 0 at −1 to 1 at 1. So it
-sends their mean radiosity as long as it is near them. Otherwise receivers before a cloth would see the dark patches
-that it covers: spheres and convex parts block a cell before planes do.
+A patch p that texels t of a plane cover, with weights k, sends their mean radiosity as long as it is near them: x_p is
+the center of its proxy, d_p, at least its radius, its distance from these texels in the scene as given, and S the
+smoothstep from 0 at −1 to 1 at 1. Otherwise receivers before a cloth would see the dark patches that it covers, since
+spheres and convex parts block a cell before planes do.
 """
 
 import numpy as np

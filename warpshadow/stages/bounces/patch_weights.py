@@ -4,11 +4,11 @@
     v_p = r_p⁸ / (r_p⁸ + 0.04⁸),  r_p = Σ_s w_ps (⟨T⟩_s + ε) / Σ_s w_ps (⟨T_self⟩_s + ε)
 
 with s a patch sample of patch p, T the transmittance past all bodies but planes, T_self that past its own body, and w
-the weights of patch samples by area. The light of a patch is Σ_s w_ps f_s L_s: samples that lie inside another body, or
-between books on a shelf, are dark, and few see them. By v, patches that other bodies bury wholly count hardly at all
-beside others, in a texel of a plane or among the proxies that a receiver sees through a cell.
+the weights of patch samples by area. The light of a patch is Σ_s w_ps f_s L_s.
 
-Without f a pile of bodies that stick in each other was 19% off, and without v the ground around it 11% too dark.
+By f, samples inside another body, or between books on a shelf, count little: they are dark, and few see them. By v,
+patches that other bodies bury wholly count hardly at all in a texel of a plane or among proxies in a cell. (A pile of
+bodies that stick in each other was 19% off without f, the ground around it 11% too dark without v.)
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Plane hits: the sides of planes that a cell of a receiver meets, how they hide each other, and their radiosity.
+"""Plane hits: which share of a receiver's cell sees each side of a plane, past the sides in front, and its radiosity.
 
 Known of a side k, in a cell with direction ω and angular radius ρ (:mod:`warpshadow.stages.cell_coverage`):
 
@@ -6,26 +6,24 @@ Known of a side k, in a cell with direction ω and angular radius ρ (:mod:`warp
     y_k = μ_k / h_k   centroid of the covered part, in radii ρ from the middle of the cell
     g_k = N_k / d_k   inverse distances: along a direction ω the side is 1 / (g_k·ω) away
 
-Sides k and j share a part of the cell, which is taken to be around ω + ρ (y_k + y_j). Side j is in front in a share
+1. Two sides k and j share a part of the cell around ω + ρ (y_k + y_j). Side j is in front in the share
 
-    S_kj = S((g_j − g_k)·(ω + ρ (y_k + y_j)) / ρ √(h_k h_j (|P(g_j − g_k)|² + 10⁻⁶ (|g_k|² + |g_j|²))))
+       S_kj = S((g_j − g_k)·(ω + ρ (y_k + y_j)) / ρ √(h_k h_j (|P(g_j − g_k)|² + 10⁻⁶ (|g_k|² + |g_j|²))))
 
-of it, where P projects to the plane that touches the sphere of directions, and S is the smoothstep from 0 at −1 to 1 at
-1: it cuts a disc as large as the shared part by the line in which both sides meet. The sides in front of k leave the
-share o_k of the cell open, and block with the moment m_k:
+   of it: the line in which both sides meet cuts a disc as large as the shared part. P projects to the plane that
+   touches the sphere of directions, S is the smoothstep from 0 at −1 to 1 at 1.
+2. The sides in front of k leave the share o_k of the cell open, and block with the moment m_k:
 
-    o_k = 1 − Σ_j S_kj h_j,  m_k = Σ_j S_kj μ_j
+       o_k = 1 − Σ_j S_kj h_j,  m_k = Σ_j S_kj μ_j
 
-So the share h_k o_k of the cell sees side k. Its radiosity is looked up around ω + ρ z_k, away from all that blocks it,
-over a footprint √o as wide:
+3. So the share h_k o_k of the cell sees side k. Convex parts in front of all planes cover h₀ of the cell, with the
+   moment μ₀ (:mod:`warpshadow.stages.convex.coverage`); the transmittance takes them off.
+4. Radiosity is looked up around ω + ρ z_k, away from all that blocks it, over a footprint √o as wide:
 
-    z_k = −m / √(o² + |m|²),  o = o_k (1 − h₀),  m = m_k + μ₀
+       z_k = −m / √(o² + |m|²),  o = o_k (1 − h₀),  m = m_k + μ₀
 
-The root keeps that point in the cell. Convex parts cover h₀ of the cell, with the moment μ₀, in front of all planes
-(:mod:`warpshadow.stages.convex.coverage`); the transmittance takes them off the share h_k o_k.
-
-Why: a mean over all of a side in a cell would have parts that nearer sides hide, as the sunlit ground behind a garage's
-front wall.
+   The root keeps that point in the cell. A mean over all of the side in the cell would have parts that nearer sides
+   hide, as the sunlit ground behind a garage's front wall.
 
 Light of planes in a garage is 2.6% off, without o 3.5%, by sides ordered by distance 6.5%. Without h₀ the light of the
 sunlit ground on the roof of a barn was 1.4 to 1.6 times too strong.

@@ -3,9 +3,9 @@
     I = 4/Q Σ_q max(n·ω_q, 0) T_q min(1, Σ_k h_k) Σ_k h_k o_k B_k / Σ_k h_k o_k
 
 For each side k of a plane that cell q meets, h_k is its coverage, o_k the share that nearer sides leave open of that,
-and B_k the radiosity of the part that is seen (:mod:`.plane_hits`), from the texels of the plane
-(:mod:`.plane_texels`). T_q is the transmittance past all other bodies. So planes send all that they block of a cell
-(:mod:`warpshadow.stages.planes.coverage`), as much of it as is seen of each; by Σ h_k o_k B_k alone cells in which
+and B_k the radiosity of the visible part (:mod:`.plane_hits`), from the texels of the plane (:mod:`.plane_texels`). T_q
+is the transmittance past all other bodies. Planes send all that they block of a cell
+(:mod:`warpshadow.stages.planes.coverage`), as much of it as is seen of each: by Σ h_k o_k B_k alone, cells in which
 walls meet would lose h_k h_j. A plane is seen from both sides; its back is black unless it has patches there.
 
 A ball over a ground with the shadow of a disc is 2.0% off in 128 cells, and 1.3% in 1024.
@@ -185,8 +185,7 @@ def plane_light(
     """Light that planes send to receivers, added to other light.
 
     Args:
-        points: Receivers [scene units], vec3 of shape [batch, receiver].
-        normals: Their unit normals, vec3 of shape [batch, receiver].
+        points, normals: Receivers [scene units] and their unit normals, vec3 of shape [batch, receiver].
         transmittance: Past all else, without the planes, float32 of shape [batch, receiver, direction].
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`PlaneBlockers.frames`.
         texels: Radiosity of the planes, vec3 of shape [batch, texel], from :func:`.plane_texels.find_texels`. A batch

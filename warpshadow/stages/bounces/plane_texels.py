@@ -3,10 +3,8 @@
     B = Σ_p k_p v_p B_p / Σ_p k_p v_p                  [normalized convolution: Knutsson and Westin 1993]
 
 with v the weight of a patch (:mod:`.patch_weights`), and k its share of the mesh in the texel, or 0.002 of that in a
-texel beside it. So a texel of buried patches alone, as under a box, has the light of those beside it, and others hardly
-any of that. Otherwise their darkness would be interpolated to the patches around the box.
-
-Without v the foot of a thick wall in the sun was 2.5% too dark.
+texel beside it: a texel of buried patches alone, as under a box, has the light of those beside it. Otherwise its
+darkness would be interpolated to the patches around the box (the foot of a thick wall in the sun was 2.5% too dark).
 """
 
 import warp as wp

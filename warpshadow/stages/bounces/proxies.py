@@ -1,15 +1,17 @@
 """Proxies: the spheres that send the light of patches of bodies that are not flat.
 
 A patch of area A has a proxy of radius ρ = √(A/2), as wide as the diagonal of a square patch, so that neighbors
-overlap. As the body grows, so does it, in the ratio of the nearest sphere that blocks light. Its center is at a depth
-below the patch,
+overlap; it grows with the body, in the ratio of the nearest sphere that blocks light. Where the body is h thick, its
+center is below the patch at the depth
 
     (3/4 min(h / 2ρ, 1) − 1/4) ρ
 
-where the body is h thick: ρ/2 below if it is thicker than the proxy, so that the proxy bulges out by ρ/2, and ρ/4 above
-if it is a sheet, whose other side has patches of its own. So a receiver is nearer to visible patches than to the
-patches behind them, whose light would shine through a tent or a thin wall. A receiver that touches a body is within
-proxies of several of its sides, and sees those whose tangent planes it is above (:mod:`.tangent_planes`).
+- Under a thick body, ρ/2: the proxy bulges out by ρ/2.
+- In a sheet, ρ/4 above: the other side has patches of its own.
+
+So a receiver is nearer to visible patches than to those behind them, whose light would shine through a tent or a thin
+wall. One that touches a body is within proxies of several of its sides, and sees those whose tangent planes it is above
+(:mod:`.tangent_planes`).
 
 One proxy for each patch, not each blocking sphere: the foot of a ball on a ground sees the dark part below the ball.
 """

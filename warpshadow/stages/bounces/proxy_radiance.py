@@ -2,13 +2,13 @@
 
     E_j(ω) = Σ_p A_p (v_p g_p + ε) B_p / Σ_p A_p (v_p g_p + ε),  ε = 0.0001
 
-is the mean of the radiosities B of proxy j's patches, of which a cluster has several, by the area that they show in
-direction ω: g_p of a unit (:mod:`.projected_areas`), counted by v_p, since other bodies may bury them
-(:mod:`.patch_weights`). Patches that face away count for ε of their area: where none shows itself the mean is still
-one, smooth and not divided by zero. ε is small since a sunlit top is some hundred times brighter than the bottom.
+is the mean of the radiosities B of proxy j's patches (a cluster has several) by the area that they show in direction ω:
+g_p of a unit (:mod:`.projected_areas`), counted by v_p, since other bodies may bury them (:mod:`.patch_weights`). With
+ε the mean stays smooth where no patch faces the receiver; it is small since a sunlit top is some hundred times brighter
+than the bottom.
 
-Through a cell a receiver sees a mean over the proxies in it (:mod:`.sphere_light`), which count by the area that they
-show, too. So numerator and denominator stay apart, both over Σ_p A_p.
+Numerator and denominator stay apart, both over Σ_p A_p: through a cell a receiver sees a mean over the proxies in it,
+which count by the area that they show, too (:mod:`.sphere_light`).
 """
 
 import numpy as np

@@ -3,15 +3,14 @@
     I = 4/Q Σ_q max(n·ω_q, 0) (F_q − T_q) R_q
     R_q = Σ_j w_j a_jq L_jq / Σ_j w_j a_jq S_jq
 
-R is the mean radiosity of the proxies j that block cell q in part, blended without sorting [McGuire and Bavoil 2013,
-weighted blended order-independent transparency]. T_q is the transmittance past them, F_q that without them, so the
-light is all that a cell lacks. a_jq are the shares of the transmittance, T_q = F_q Π_j (1 − a_jq), w the weights of
-:mod:`.proxy_weights`, L and S the light and the area that proxies show (:mod:`.proxy_radiance`). R is smooth in
-everything, stays within the radiosities of the patches, and does not depend on the scene's units.
+The light is all that a cell lacks: T_q is the transmittance past the proxies j, F_q that without them. R is the mean
+radiosity of those that block the cell in part, blended without sorting [McGuire and Bavoil 2013, weighted blended
+order-independent transparency]: a_jq are the shares of the transmittance, T_q = F_q Π_j (1 − a_jq), w the weights of
+:mod:`.proxy_weights`, L and S the light and the area that proxies show (:mod:`.proxy_radiance`). R is smooth, within
+the radiosities of the patches, and independent of the scene's units.
 
-The traversal is that of the transmittance, with other visits. The adjoint needs both sums of R of the cells in which
-light is blocked; the forward launch stores them: 16 bytes a receiver and cell, touched only in bundles of cells that
-are blocked in part. N bounces store N times that.
+The traversal is that of the transmittance, with other visits. For the adjoint the forward launch stores both sums of R:
+16 bytes a receiver and cell, touched only in bundles of cells that are blocked in part; N bounces store N times that.
 """
 
 import functools
@@ -411,18 +410,16 @@ def sphere_light(
     """Light that proxies send to receivers, through the cells that they block, added to other light.
 
     Args:
-        points, normals, centers, radii: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
+        points, normals, centers, radii, directions, softness, merging, skip, clusters: As for
+            :func:`warpshadow.stages.visibility.directional.transmittance`.
         proxy_radiance: Light and area that proxies, clusters included, show towards cells, vec4 of shape [batch, proxy,
-            direction], from :func:`.proxy_radiance.find_proxy_radiance`. A batch of 1 serves every instance.
+            direction], from :func:`.proxy_radiance.find_proxy_radiance`.
         transmittance: T past these spheres and all else that F is past, float32 of shape [batch, receiver, direction],
             made with the same directions, softness, merging and skip.
-        transmittance_others: F, the factor of T without these spheres, of the same shape; a batch of 1 serves every
-            instance. None for 1.
-        directions: Unit vectors ω, NumPy of shape [direction, 3], from :func:`warpshadow.fibonacci`.
-        softness, merging, skip, clusters: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
-        tangent_planes: Of the proxies, which show nothing below them. A batch of 1 serves every instance. None for
-            proxies that are seen from everywhere.
-        addend: The other light, vec3 of shape [batch, receiver]; a batch of 1 serves every instance. None for 0.
+        transmittance_others: F, the factor of T without these spheres, of the same shape; None for 1.
+        tangent_planes: Of the proxies, which show nothing below them; None for proxies that are seen from everywhere.
+            Batches of 1 of these, of proxy_radiance and of transmittance_others serve every instance.
+        addend: The other light, vec3 of shape [batch, receiver]; None for 0.
     Returns:
         Light that a white receiver reflects of it, vec3 of shape [batch, receiver]: 1 where all patches are white and
         radiant by 1.

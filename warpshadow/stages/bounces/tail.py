@@ -1,16 +1,18 @@
 """Tail: the light of all further bounces, extrapolated from the computed ones.
 
-Radiosities B_k after k bounces are sums of B_0 and terms D_k = B_k − B_(k−1), of which each is the same linear map T of
-the one before. All light past B_0 is R = D_1 + T R. It is sought among the sums Σ_j c_j D_j, 1 ≤ j ≤ 3, as the one
-whose error D_1 + T R − R is orthogonal to these terms, in each color and with areas A as weights [Galerkin; Saad 2003,
-chapter 5]:
+Radiosities B_k after k bounces are sums of B_0 and terms D_k = B_k − B_(k−1), each the same linear map T of the one
+before. All light past B_0, R = D_1 + T R, is sought among the sums Σ_j c_j D_j, 1 ≤ j ≤ 3, as the one whose error
+D_1 + T R − R is orthogonal to these terms, in each color and with areas A as weights [Galerkin; Saad 2003, chapter 5]:
 
     Σ_j M_ij c_j = <D_i, D_1>,   M_ij = <D_i, D_j − D_(j+1)>,   <u, v> = Σ_p A_p u_p v_p
 
 and T is applied to it once more: B_1 + Σ_j c_j D_(j+1). Sums of three geometric series are exact, such as of light that
-a room, a bowl and a gap keep for different times. Where terms are nearly multiples of each other the smallest c count:
-1e-7 is added to the diagonal of M, with D of length 1. In a closed room of white walls the series diverges: where
-<D_1, R> is below 0 or above 50 <D_1, D_1>, terms from D_3 on count as if each were 0.98 of the one before.
+a room, a bowl and a gap keep for different times.
+
+- Terms that are nearly multiples of each other: 1e-7 is added to the diagonal of M, with D of length 1, so that the
+  smallest c count.
+- A closed room of white walls, where the series diverges (<D_1, R> is below 0 or above 50 <D_1, D_1>): terms from D_3
+  on count as if each were 0.98 of the one before.
 
 In a room of albedo 0.8 with a window the energy is 0.3% off; by one term in place of three it would be 0.9%, and at an
 albedo of 1 8% too low.

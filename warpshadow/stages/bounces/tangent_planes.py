@@ -6,12 +6,12 @@ A receiver x at the distance d from a proxy's center takes of its light the fact
 
 with n and p the mean normal and point of the proxy's patches, σ the largest angle of their surface to n, b how far it
 lies below the tangent plane, and r the proxy's radius. A flat patch is seen from above alone, one of a ball by σ from
-farther below. The area that patches show (:mod:`.projected_areas`) decides that from afar; but a receiver beside or
-inside a proxy, as a wall under a roof, has it in all directions. ε keeps the sum of weights above 0: some cells are
-blocked by spheres that bulge out of a flat side, none of whose patches faces the receiver; there every proxy has ε, and
-the light is their plain mean.
+farther below. From afar the area that patches show (:mod:`.projected_areas`) decides that; but a receiver beside or
+inside a proxy, as a wall under a roof, has it in all directions.
 
-Here are n, p, sin σ and w; f is part of a proxy's weight (:mod:`.proxy_weights`).
+ε keeps the sum of weights above 0: where cells are blocked by spheres that bulge out of a flat side, and no patch faces
+the receiver, the light is the plain mean. Here are n, p, sin σ and w; f is part of a proxy's weight
+(:mod:`.proxy_weights`).
 """
 
 from collections.abc import Sequence

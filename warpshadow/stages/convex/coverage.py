@@ -1,11 +1,10 @@
 """Coverage of cells by convex blockers, such as boxes and rods.
 
-Each piece of a body covers h_q = Σ_parts h, with the moment Σ_parts μ, of cell q: h and μ are the coverage by the
-silhouette of a convex part (:mod:`warpshadow.stages.cell_coverage`), the edges between a face that a receiver sees and
-one that it does not. Parts of one piece are beside each other, so they cover different parts of a cell. Prisms into
-which a piece is cut both cover their seam, the face between them, where they are seen at a slant: it is taken off. How
-pieces relate, :mod:`warpshadow.stages.joint_coverage` tells. Edges are exact, and so are thin parts: spheres bulge out
-of them.
+Edges are exact, and so are thin parts: spheres bulge out of them. Each piece of a body covers h_q = Σ_parts h, with the
+moment Σ_parts μ, of cell q: h and μ are the coverage by the silhouette of a convex part
+(:mod:`warpshadow.stages.cell_coverage`), the edges between a face that a receiver sees and one that it does not. Parts
+of one piece cover different parts of a cell, but for the seams of prisms into which it is cut, which both cover where
+seen at a slant: these are taken off. :mod:`warpshadow.stages.joint_coverage` tells how pieces relate.
 """
 
 import functools
@@ -308,7 +307,6 @@ def part_coverage(
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
         placed_parts: Where the parts are, from :meth:`.ConvexBlockers.place`; the batch may be 1.
-        blockers: The bodies.
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         radius: Of cells that do not tile the sphere [rad]; by default that of so many even ones, which do.
         horizon_normals: Normals, vec3 of shape [batch, receiver]: nothing blocks cells below the horizon.

@@ -157,11 +157,11 @@ def make_joint_functions(lanes: int) -> JointFunctions:
 
     @wp.func_native(f"""
     for (int lane = 0; lane < {lanes}; ++lane) {{
-        const int vertex = block * {lanes} + lane;
+        const int receiver = block * {lanes} + lane;
         for (int k = 0; k < rows.shape[1]; ++k) {{
             wp::vec_t<4, float> value;
-            if (vertex < rows.shape[0])
-                value = wp::index(rows, vertex, k);
+            if (receiver < rows.shape[0])
+                value = wp::index(rows, receiver, k);
             wp::index(scratch, k).share.c[lane] = value.c[0];
             wp::index(scratch, k).moment.x.c[lane] = value.c[1];
             wp::index(scratch, k).moment.y.c[lane] = value.c[2];
@@ -170,23 +170,23 @@ def make_joint_functions(lanes: int) -> JointFunctions:
     }}
     """)
     def load_columns(rows: wp.array2d(dtype=wp.vec4), block: int, scratch: wp.array(dtype=Coverages)):
-        """scratch[k] = rows[the block's vertices, k], 0 past the last vertex."""
+        """scratch[k] = rows[the block's receivers, k], 0 past the last receiver."""
         ...
 
     @wp.func_native(f"""
     const int first = block * {lanes};
     const int past = first + {lanes} < rows.shape[0] ? first + {lanes} : rows.shape[0];
-    for (int vertex = first; vertex < past; ++vertex)
+    for (int receiver = first; receiver < past; ++receiver)
         for (int k = 0; k < rows.shape[1]; ++k) {{
-            wp::vec_t<4, float>& value = wp::index(rows, vertex, k);
-            value.c[0] = wp::index(scratch, k).share.c[vertex - first];
-            value.c[1] = wp::index(scratch, k).moment.x.c[vertex - first];
-            value.c[2] = wp::index(scratch, k).moment.y.c[vertex - first];
-            value.c[3] = wp::index(scratch, k).moment.z.c[vertex - first];
+            wp::vec_t<4, float>& value = wp::index(rows, receiver, k);
+            value.c[0] = wp::index(scratch, k).share.c[receiver - first];
+            value.c[1] = wp::index(scratch, k).moment.x.c[receiver - first];
+            value.c[2] = wp::index(scratch, k).moment.y.c[receiver - first];
+            value.c[3] = wp::index(scratch, k).moment.z.c[receiver - first];
         }}
     """)
     def store_columns(scratch: wp.array(dtype=Coverages), block: int, rows: wp.array2d(dtype=wp.vec4)):
-        """rows[the block's vertices, k] = scratch[k]."""
+        """rows[the block's receivers, k] = scratch[k]."""
         ...
 
     return JointFunctions(

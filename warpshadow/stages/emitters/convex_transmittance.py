@@ -7,10 +7,11 @@ the outward normals N_f and offsets o_f of the faces that x sees, it takes the s
     a = S(p) S(q),   p = min_e m_e·(y − x) / R,   q = min_f (o_f − N_f·y) / R
 
 of the beam of the sample, a disc of radius R; S is the smoothstep from −1 to 1. Parts of a piece of a body are beside
-each other, so their shares add up, and T = max(1 − Σ a, 0.0001) is left past the piece: where two parts touch, all of a
-sample is hidden. Pieces are independent. (A bulb in an open shade of 15 panels in a room is 3.5% off by sums, 5.0% by
-products, which let a quarter of a sample's light through at seams. Sums over all of a body are no better: cages, chairs
-and shelves are within 0.1% of each other by either, and two rows of slats behind each other are darker.)
+each other, so their shares add up: T = max(1 − Σ a, 0.0001) is left past the piece, and where two parts touch, all of a
+sample is hidden. Pieces are independent.
+
+A bulb in an open shade of 15 panels in a room is 3.5% off; with products, which let a quarter of a sample's light
+through at seams, 5.0%. Sums over all of a body are no better: two rows of slats behind each other are darker.
 """
 
 import warp as wp
@@ -336,8 +337,6 @@ def find_log_transmittance_of_parts(
 
     Args:
         points, normals, samples, span: As for :func:`.sphere_transmittance.find_log_transmittance`.
-        placed_parts: Where the parts are.
-        blockers: The bodies that consist of them.
         skipped: Indices of bodies among these that do not block, −1 for none: the receivers' and the emitter's.
     Returns:
         Float32 of shape [batch, receiver, sample].

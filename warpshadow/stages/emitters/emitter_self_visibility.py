@@ -113,8 +113,6 @@ def find_self_visibility(
     Args:
         positions, faces: Its mesh [units of the body], shapes [vertex, 3] and [face, 3].
         sample_points: Middles of its samples [units of the body], shape [sample, 3].
-        surface_points: Points of each sample.
-        is_two_sided: Whether it is open.
     Returns:
         None for a body that hides next to nothing of itself, such as a convex one.
     """
@@ -225,16 +223,13 @@ def look_up_self_visibility(
     span: EmitterSpan,
     self_visibility: EmitterSelfVisibility,
     *,
-    is_own: bool = False,
+    is_on_emitter: bool = False,
 ) -> wp.array:
     """Transmittance of an emitter's own body between receivers and its samples.
 
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
-        samples: Of all emitters.
-        span: Those of the emitter.
-        self_visibility: Its own.
-        is_own: Whether the receivers lie on the emitter.
+        is_on_emitter: Whether the receivers lie on the emitter.
     Returns:
         Float32 of shape [batch, receiver, sample].
     Differentiable: points, samples.
@@ -256,7 +251,7 @@ def look_up_self_visibility(
         count * points.shape[1],
         inputs=[
             *(points, sample_points, span.first, moments, nearest_rotations(moments), *table, *cells),
-            *(_REACH_COSINE, _REACH_ON_LAMP if is_own else 1.0),
+            *(_REACH_COSINE, _REACH_ON_LAMP if is_on_emitter else 1.0),
         ],
         outputs=[weighted_sums],
         shared=[points, sample_points, moments],

@@ -5,8 +5,8 @@
 L_k is the radiance of sample k, A_k its area vector, d_k and ω_k the distance and the direction to its middle, T_k the
 transmittance on the way past spheres, planes, convex parts, the receiver's own body and the emitter's. E is over π, as
 all shading is. The root is π d² but for receivers closer to a sample than samples are to each other, where nothing
-becomes infinite. (The form factor of a disc on its axis has π d² + |A| in place of the root; samples are beside each
-other.) An open body sends light to both sides: |A_k·ω_k| is in place of the maximum.
+becomes infinite. (A disc on its axis has π d² + |A| instead; samples are beside each other.) An open body sends light
+to both sides: |A_k·ω_k| is in place of the maximum.
 
 Receivers closer than about three times its half diagonal see a sample as its pieces, triangles whose
 form factors (:mod:`.triangles`) are in place of the fraction.
@@ -247,11 +247,8 @@ def sum_light(
     """Light of an emitter on receivers.
 
     Args:
-        points: Receivers [scene units], vec3 of shape [batch, receiver].
-        normals: Their unit normals, vec3 of shape [batch, receiver].
-        samples: Of all emitters.
+        points, normals: Receivers [scene units] and their unit normals, vec3 of shape [batch, receiver].
         radiance: Of the samples, linear RGB, vec3 of shape [batch, sample].
-        span: Those of the emitter.
         transmittance: To these, float32 of shape [batch, receiver, sample]; None for 1. Any batch may be 1.
     Returns:
         vec3 of shape [batch, receiver].

@@ -6,14 +6,16 @@ outline of the plane, positive inside, along m, the plane takes the share
 
     a = S((s / w + 1) / 2),   w² = b² (1 + (ω·m / ω·n)²)
 
-of it, S the smoothstep and n the plane's normal: the projection of the beam reaches w along m. The disc itself, with a
-normal k, reaches r = R √(1 − (k·n)²) off its middle along n, a margin at least; if that is less than r above the plane,
-on the receiver's side, a part of the sample lies beyond, as of a lamp that is half in the ground:
+of it, S the smoothstep and n the plane's normal: the projection of the beam reaches w along m.
 
-    a S((1 − h_y / r) / 2)      h_y: height over the plane, and two margins, so that a lamp in the plane is whole
+A sample less than r above the plane, on the receiver's side, lies beyond it in part, as of a lamp half in the ground:
 
-A disc is wider than a sample of a thin lamp, which may lie on the plane: r counts as far as the lamp is on both sides.
-With samples that lay beyond wholly or not at all a lamp that was half in the ground was off by −7 to +8%.
+    a S((1 − (y_n + 2ε) / r) / 2),   r = max(R √(1 − (k·n)²), ε)
+
+y_n is the height of the sample's middle, r how far its disc, of normal k, reaches along n, and ε the plane's margin, a
+thousandth of a texel; 2ε makes a lamp in the plane whole. A disc is wider than a sample of a thin lamp, which may lie
+on the plane: r counts as far as the lamp is on both sides. (With samples wholly beyond or not at all, a lamp half in
+the ground was off by −7 to +8%.)
 """
 
 import warp as wp

@@ -77,8 +77,7 @@ def find_sample_weights(
     """Find the samples of an emitter.
 
     Args:
-        positions: Vertices at rest [units of the body], shape [vertex, 3].
-        faces: Faces that wind alike, shape [face, 3].
+        positions, faces: Vertices at rest [units of the body], shape [vertex, 3], and faces that wind alike, [face, 3].
         is_two_sided: Whether the body is open; samples of both sides are the same.
     """
     from scipy.sparse import csr_matrix, diags

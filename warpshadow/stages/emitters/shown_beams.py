@@ -74,7 +74,6 @@ def show_beams(
         faces: Corners, vec3i of shape [face].
         positions: Vertices [scene units], vec3 of shape [batch, vertex].
         clip_matrices: Cameras, mat44 of shape [batch].
-        samples: Of all emitters.
         emitter_of_face: Number of the emitter that each face is of, −1 for none, int32 of shape [face].
         beams: Of all emitters, shape [emitter, 2].
     Returns:

@@ -137,10 +137,7 @@ def find_log_transmittance(
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
         normals: Their unit normals, vec3 of shape [batch, receiver]: samples below horizons are left at 0.
-        samples: Of all emitters.
-        span: Those of the emitter.
-        centers: Of the spheres [scene units], vec3 of shape [batch, sphere].
-        radii: Of the spheres [scene units], float32 of shape [batch, sphere].
+        centers, radii: Spheres [scene units], vec3 and float32 of shape [batch, sphere].
         skipped: Two spans of spheres that do not block: the first, and the one after the last.
             Any batch may be 1.
     Returns:

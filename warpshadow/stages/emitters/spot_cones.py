@@ -41,8 +41,7 @@ def find_axis_weights(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndar
     It is the mean normal; or −z at rest where normals nearly cancel, as those of a closed body do.
 
     Args:
-        positions: Vertices at rest [units of the body], shape [vertex, 3].
-        faces: Faces that wind alike, shape [face, 3].
+        positions, faces: Vertices at rest [units of the body], shape [vertex, 3], and faces that wind alike, [face, 3].
     Returns:
         Of shape [vertex] and [face].
     """
@@ -95,8 +94,6 @@ def weigh_by_beam(
 
     Args:
         points: Receivers [scene units], vec3 of shape [batch, receiver].
-        samples: Of all emitters.
-        span: Those of the emitter.
         transmittance: Float32 of shape [batch, receiver, sample]; None for 1. Any batch may be 1.
     Returns:
         Float32 of shape [batch, receiver, sample]; the transmittance itself where the emitter has no beam.

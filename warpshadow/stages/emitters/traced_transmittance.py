@@ -263,12 +263,9 @@ def trace_transmittance(
 
     Args:
         mesh: The blockers, the emitter among them if it blocks light; None for none.
-        points: Receivers [scene units], vec3 of shape [receiver].
-        normals: Their unit normals, vec3 of shape [receiver].
-        samples: Of all emitters.
+        points, normals: Receivers [scene units] and their unit normals, vec3 of shape [receiver].
         positions: All vertices [scene units], of one instance, vec3 of shape [vertex].
         sample_points, sample_areas: Of :class:`.samples.PlacedSamples`, of one instance.
-        span: Samples of the emitter.
         rays: To each sample, spread over its points; no more than these.
     Returns:
         Float32 of shape [receiver, sample]; 0 where a sample sends nothing.

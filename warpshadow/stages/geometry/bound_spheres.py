@@ -107,8 +107,7 @@ class SphereBinding:
         Args:
             points: Vertices [scene units], shape [vertex, 3].
             vertices: The candidates that spheres may follow, shape [candidate].
-            centers: Of the spheres [scene units], shape [sphere, 3].
-            radii: Of the spheres [scene units], shape [sphere].
+            centers, radii: Spheres [scene units], shapes [sphere, 3] and [sphere].
         """
         from scipy.spatial import cKDTree
 

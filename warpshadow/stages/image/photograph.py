@@ -1,15 +1,15 @@
 """Photographs: bodies put into one, with the shadows that they cast on its surfaces.
 
-Some bodies of the scene, the catchers, model surfaces in the photograph. They are not drawn. Where a sample sees one
-that receives the light S with all bodies and S₀ with catchers alone, the photograph P becomes [Debevec 1998, section 6,
-by a ratio in place of a difference, which asks for no albedo]
+Some bodies, the catchers, model surfaces in the photograph and are not drawn. Where a sample sees one that receives the
+light S with all bodies and S₀ with catchers alone, the photograph P becomes [Debevec 1998, section 6, by a ratio in
+place of a difference, which asks for no albedo]
 
     P (1 + (S − S₀) r),    r = S₀⁺ / (S₀⁺² + ε²)
 
-which is P S / S₀ where S₀ ≫ ε, up to a factor 1 + (ε/S₀)², and P where S₀ → 0, where the ratio is not known. ε is 1/256
-of the mean of S₀ over the samples that would see catchers without the other bodies: less than a photograph of 8 bits
-tells from black. The factor of P is averaged over the samples of a pixel and smoothed at silhouettes, P is not: pixels
-without a shadow stay as they are.
+This is P S / S₀ where S₀ ≫ ε, up to a factor 1 + (ε/S₀)², and P where S₀ → 0 and the ratio is not known. ε is 1/256 of
+the mean of S₀ over the samples that would see catchers without the other bodies: less than a photograph of 8 bits tells
+from black. The factor of P is averaged over a pixel and smoothed at silhouettes, P is not: pixels without a shadow stay
+as they are.
 """
 
 from typing import NamedTuple

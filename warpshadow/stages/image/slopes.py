@@ -1,31 +1,35 @@
 """Slopes: how samples change as surfaces move over the screen, by the mean gradient of color over each sample.
 
-A surface of color c that moves over the screen by v changes a sample by −∇c · v. At the sample's point ∇c is that of
-one face, of many where faces are as small as samples; and towards a limb, where shading changes faster and faster, it
-is far from the mean. So the mean over the sample is taken. To the right of the sample color changes by
+A surface of color c that moves over the screen by v changes a sample by −∇c · v. Here ∇c is its mean over the sample.
+(At the sample's point it would be that of one face, of many where faces are as small as samples, and far from the mean
+towards a limb, where shading changes faster and faster.) To the right of the sample color changes by
 
     ½ (c_right − c) over ½ sample    if the neighbor's center is on the surface,
-    c_edge − c over t samples        if the surface has an edge before, of color c_edge at distance t,
+    c_edge − c over t samples        if the surface ends before, at distance t, with the color c_edge,
 
-and likewise to the other sides. An edge at t > ½ lies in the neighbor, which shows this surface up to it. With the step
-c_edge − c over t, steps along a row add up to the color at the surface's right edge minus that at its left; the
-derivative of the moving edges has the same with the other sign. They cancel only if the step to an edge follows the
-edge's point, and if a sample counts along a row as far as its surface reaches there: 1, or ½ + t beside an edge (along
-a column likewise). The smoothed image weighs it once for both axes; so slopes are multiplied by extent / weight. (Else
-a ball of metal of roughness 0.2 before a sun has a gradient of −3500 where the slope of the image is 1300; so it has
-1630.)
+and likewise to the other sides:
 
-Where another surface comes in front before the neighbor's center, or the image ends, the opposite half counts alone.
-Where all neighbors see the same face, the slope is the face's own.
+- An edge at t > ½ lies in the neighbor, which shows this surface up to it.
+- Where another surface comes in front before the neighbor's center, or the image ends, the opposite half counts alone.
+- Where all neighbors see the same face, the slope is the face's own.
 
-A sample that is a receiver itself has the exact derivative at its point instead, except near the outline of its
-surface. There the exact slope is often tiny and rarely huge, as it grows without bound towards a limb, and does not
-match the colors at the edges: gradients of a mirroring ball are half of the differences of images. With mean slopes of
-the samples along an outline, and of those up to two steps away, the colors of edges cancel. (One is too few for the
-highlight of a sun, which may be three samples wide: across the outline gradients had the wrong sign.)
+These steps add up along a row to the color at the surface's right edge minus that at its left, which the moving edges
+contribute with the other sign. So the two cancel, as they must, if
 
-The albedo of vertices or a texture has the exact derivative, too, which keeps its detail, and likewise mean slopes near
-outlines: c is a product, light times albedo, of which either factor moves or both do.
+- the step to an edge follows the edge's point, and
+- a sample counts along a row as far as its surface reaches there: 1, or ½ + t beside an edge (along a column likewise).
+  The smoothed image weighs it once for both axes; so slopes are multiplied by extent / weight.
+
+*Near* an outline, up to :data:`REACH` steps from it, mean slopes also replace exact derivatives, which are kept
+elsewhere: of samples that are receivers themselves, and of the albedo of vertices or a texture, for its detail. Towards
+a limb an exact slope is often tiny and rarely huge, and does not match the colors at the edges. Color is a product,
+light times albedo, of which either factor moves or both do.
+
+| gradients of a ball of metal | without it | with it | differences of images |
+| --- | --- | --- | --- |
+| extent / weight, before a sun | −3500 | 1630 | 1300 |
+| mean slopes near outlines, mirroring | half | | 1 |
+| a second step near outlines, at a sun's highlight three samples wide | wrong sign | | |
 """
 
 from dataclasses import replace
@@ -95,9 +99,9 @@ def _face_slope(values: wp.vec3, corners: wp.vec3i, center: wp.vec2, clip_positi
 def _distance_to_end(
     fragments: FragmentArrays, entries: wp.array(dtype=wp.int32), edges: wp.array2d(dtype=wp.vec2i), sample: int, k: int
 ):
-    """How far before a sample's neighbor in direction k its surface ends [samples]; −1 if it does not, as one can tell.
+    """Distance at which a sample's surface ends before its neighbor in direction k [samples].
 
-    −2 where the neighbor sees another surface, or there is none.
+    −1 if no edge is known between them; −2 if the neighbor sees another surface or nothing, or is outside.
     """
     if not has_neighbor(sample, k, fragments.width, fragments.height):
         return -2.0
@@ -389,9 +393,9 @@ def moving_radiance(
     Returns:
         Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width]; and the edge colors, with which
         :func:`warpshadow.stages.silhouettes.smooth.smooth_silhouettes` is to be called.
-    Differentiable: shading, albedo, clip_positions; the latter in place of barycentrics of the fragments, but for the
-    samples that are receivers themselves or interpolate between such, whose gradient is that of the receivers' points
-    unless they have mean slopes. By albedo samples are moved where it has a mean slope.
+    Differentiable: shading, albedo, clip_positions. The latter stand for the barycentrics of the fragments, but not of
+    samples that are receivers themselves, or interpolate between such, without mean slopes: these have the gradient of
+    the receivers' points. By albedo samples are moved where it has a mean slope.
     """
     fragments = replace(fragments, barycentrics=without_gradient(fragments.barycentrics))
     light = None

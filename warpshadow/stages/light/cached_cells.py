@@ -126,6 +126,5 @@ def add_rows(cached: CachedRows, sums: wp.array, channel: int = 0) -> None:
     Args:
         cached: Of shape [row, channel, item].
         sums: Float32 of shape [batch, receiver, item], which no recorded launch has read yet.
-        channel: Which is added.
     """
     launch(_add_cached_rows, sums.shape[:2], inputs=[cached.index, cached.rows, channel], outputs=[sums])

@@ -84,12 +84,12 @@ def cut_map(
     """Cut an equirectangular map into rectangles of about the same importance, and take a direction of each.
 
     This is the median cut of Debevec [2005, "A median cut algorithm for light probe sampling"], for any count, through
-    pixels where they are large. A direction is the mean of its rectangle's light, and stands for all of it: so
-    receivers that see a whole rectangle get exactly its light, for any normal, and receivers on whose horizon it
-    lies get too little: so the first cut is along the horizon of level ground.
+    pixels where they are large. A direction is the mean of its rectangle's light, and stands for all of it. Receivers
+    that see all of the rectangle get exactly its light, for any normal. Receivers on whose horizon it lies see a part
+    of it and get too little; therefore the first cut is along the horizon of level ground.
 
-    Importance is luminance, to which even light adds a tenth. But suns, pixels :data:`_SUN_BRIGHTNESS` times as bright
-    as all is on average, have :data:`_SUN_SHARE` of it at most: their many directions would be close to each other.
+    Importance is luminance, to which even light adds a tenth. Suns, pixels :data:`_SUN_BRIGHTNESS` times as bright as
+    the mean, have :data:`_SUN_SHARE` of it at most: their many directions would be close to each other.
 
     Args:
         radiance: Linear RGB, shape [height, 2·height, 3]; negative lobes of a band-limited map are welcome.
@@ -159,7 +159,6 @@ def _cut_rectangle(
     Args:
         table: Importance of all above and left of each corner of pixels, [height + 1, width + 1].
         rows, columns: Where it begins and ends.
-        count: Number of rectangles.
     """
     if count == 1:
         yield rows, columns

@@ -70,23 +70,23 @@ def _shade(
     shading: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver; whole chunks of coefficients use the vector units, the remainder follows."""
-    batch, vertex = split_row(first_row + wp.tid(), shading.shape[1])
+    batch, receiver = split_row(first_row + wp.tid(), shading.shape[1])
     transfer_batch = instance_in(batch, transfer.shape[0])
     light_batch = instance_in(batch, light.shape[0])
     red = Chunk(0.0)
     green = Chunk(0.0)
     blue = Chunk(0.0)
     for chunk in range(transfer_chunks.shape[2]):
-        t = transfer_chunks[transfer_batch, vertex, chunk]
+        t = transfer_chunks[transfer_batch, receiver, chunk]
         red += wp.cw_mul(t, light_chunks[light_batch, 0, chunk])
         green += wp.cw_mul(t, light_chunks[light_batch, 1, chunk])
         blue += wp.cw_mul(t, light_chunks[light_batch, 2, chunk])
     irradiance = wp.vec3(_sum_chunk(red), _sum_chunk(green), _sum_chunk(blue))
     for k in range(CHUNK * transfer_chunks.shape[2], transfer.shape[2]):
-        irradiance += transfer[transfer_batch, vertex, k] * wp.vec3(
+        irradiance += transfer[transfer_batch, receiver, k] * wp.vec3(
             light[light_batch, 0, k], light[light_batch, 1, k], light[light_batch, 2, k]
         )
-    shading[batch, vertex] = irradiance
+    shading[batch, receiver] = irradiance
 
 
 @wp.kernel(enable_backward=False)
@@ -102,24 +102,24 @@ def _shade_adjoint_transfer(
     adj_transfer_chunks: wp.array3d(dtype=Chunk),
 ):
     """A thread owns a transfer vector and the instances that it serves:  T̄ = Σ_instances L s̄."""
-    transfer_batch, vertex = split_row(first_row + wp.tid(), adj_shading.shape[1])
+    transfer_batch, receiver = split_row(first_row + wp.tid(), adj_shading.shape[1])
     begin = transfer_batch
     end = transfer_batch + 1
     if adj_transfer.shape[0] == 1:
         end = adj_shading.shape[0]
     for batch in range(begin, end):
         light_batch = instance_in(batch, light.shape[0])
-        adj_vertex = adj_shading[batch, vertex]
+        adj_irradiance = adj_shading[batch, receiver]
         for chunk in range(light_chunks.shape[2]):
-            adj_transfer_chunks[transfer_batch, vertex, chunk] = (
-                adj_transfer_chunks[transfer_batch, vertex, chunk]
-                + adj_vertex[0] * light_chunks[light_batch, 0, chunk]
-                + adj_vertex[1] * light_chunks[light_batch, 1, chunk]
-                + adj_vertex[2] * light_chunks[light_batch, 2, chunk]
+            adj_transfer_chunks[transfer_batch, receiver, chunk] = (
+                adj_transfer_chunks[transfer_batch, receiver, chunk]
+                + adj_irradiance[0] * light_chunks[light_batch, 0, chunk]
+                + adj_irradiance[1] * light_chunks[light_batch, 1, chunk]
+                + adj_irradiance[2] * light_chunks[light_batch, 2, chunk]
             )
         for k in range(CHUNK * light_chunks.shape[2], light.shape[2]):
-            adj_transfer[transfer_batch, vertex, k] = adj_transfer[transfer_batch, vertex, k] + wp.dot(
-                adj_vertex, wp.vec3(light[light_batch, 0, k], light[light_batch, 1, k], light[light_batch, 2, k])
+            adj_transfer[transfer_batch, receiver, k] = adj_transfer[transfer_batch, receiver, k] + wp.dot(
+                adj_irradiance, wp.vec3(light[light_batch, 0, k], light[light_batch, 1, k], light[light_batch, 2, k])
             )
 
 
@@ -147,12 +147,12 @@ def _shade_adjoint_light(
         red = Chunk(0.0)
         green = Chunk(0.0)
         blue = Chunk(0.0)
-        for vertex in range(begin, end):
-            adj_vertex = adj_shading[batch, vertex]
-            t = transfer_chunks[transfer_batch, vertex, chunk]
-            red += adj_vertex[0] * t
-            green += adj_vertex[1] * t
-            blue += adj_vertex[2] * t
+        for receiver in range(begin, end):
+            adj_irradiance = adj_shading[batch, receiver]
+            t = transfer_chunks[transfer_batch, receiver, chunk]
+            red += adj_irradiance[0] * t
+            green += adj_irradiance[1] * t
+            blue += adj_irradiance[2] * t
         for i in range(CHUNK):
             wp.atomic_add(adj_light, light_batch, 0, first_direction + i, red[i])
             wp.atomic_add(adj_light, light_batch, 1, first_direction + i, green[i])
@@ -160,8 +160,8 @@ def _shade_adjoint_light(
     else:
         for k in range(first_direction, transfer.shape[2]):
             adj_coefficient = wp.vec3()
-            for vertex in range(begin, end):
-                adj_coefficient += transfer[transfer_batch, vertex, k] * adj_shading[batch, vertex]
+            for receiver in range(begin, end):
+                adj_coefficient += transfer[transfer_batch, receiver, k] * adj_shading[batch, receiver]
             for channel in range(3):
                 wp.atomic_add(adj_light, light_batch, channel, k, adj_coefficient[channel])
 
@@ -180,12 +180,12 @@ def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST
     """Light receivers: the radiance T · L of a white surface.
 
     Args:
-        transfer: Transfer vectors, float32 of shape [batch, vertex, coefficient].
+        transfer: Transfer vectors, float32 of shape [batch, receiver, coefficient].
         light: Coefficients of the light, linear RGB, vec3 of shape [batch, coefficient].
             Either batch may be 1 and then serves every instance of the other.
         maximum: Largest magnitude of a coefficient.
     Returns:
-        Shading, vec3 of shape [batch, vertex].
+        Shading, vec3 of shape [batch, receiver].
     Differentiable: transfer, light. Exact, both being linear.
     """
     check.shape("light", light.shape, ("batch", transfer.shape[2]))

@@ -152,12 +152,12 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
     """Transfer vectors to light in spherical harmonics: (V * H_n)_k / π, H_n the clamped cosine around the normal.
 
     Args:
-        visibility: SH visibility, float32 of shape [batch, vertex, order²]; None where nothing blocks.
-        normals: Unit normals, vec3 of shape [batch, vertex].
+        visibility: SH visibility, float32 of shape [batch, receiver, order²]; None where nothing blocks.
+        normals: Unit normals, vec3 of shape [batch, receiver].
         order: Number of SH bands, 2 to 8.
         bands: Number of bands that the light has, all of them by default; of others no product is computed.
     Returns:
-        Transfer vectors, float32 of shape [batch, vertex, bands²].
+        Transfer vectors, float32 of shape [batch, receiver, bands²].
     Differentiable: visibility, normals.
     """
     sh.check_order(order)
@@ -167,10 +167,10 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
         order = max(bands, 2)  # the first bands of a cosine are the same in any order
     device = normals.device
     lanes = lane_count(device)
-    batch_count, vertex_count = normals.shape
+    batch_count, receiver_count = normals.shape
     if visibility is not None:
-        check.shape("visibility", visibility.shape, (batch_count, vertex_count, order**2))
-    row_count = batch_count * block_count(vertex_count, lanes)
+        check.shape("visibility", visibility.shape, (batch_count, receiver_count, order**2))
+    row_count = batch_count * block_count(receiver_count, lanes)
     variables = [visibility, normals]
     scratch = [Scratch((3, order**2), lane_type(lanes))]
     cost = PRODUCT_COST * lanes * order**2 * bands**2
@@ -193,7 +193,7 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
             outputs=[None if variable is None else variable.grad for variable in variables],
             cost=2 * cost,
         ),
-        result=empty((batch_count, vertex_count, bands**2), dtype=wp.float32, device=device),
+        result=empty((batch_count, receiver_count, bands**2), dtype=wp.float32, device=device),
         variables=variables,
     )
 
@@ -238,21 +238,21 @@ def sh_product(visibility: wp.array, lobes: wp.array, *, order: int, bands: int 
     """Transfer vectors of lobes that are not the clamped cosine: (V * K)_k.
 
     Args:
-        visibility: V, float32 of shape [batch, vertex, order²].
-        lobes: K, float32 of shape [batch, vertex, order²].
+        visibility: V, float32 of shape [batch, receiver, order²].
+        lobes: K, float32 of shape [batch, receiver, order²].
         order: Number of SH bands, 2 to 8.
         bands: As for :func:`sh_transfer`.
     Returns:
-        Transfer vectors, float32 of shape [batch, vertex, bands²].
+        Transfer vectors, float32 of shape [batch, receiver, bands²].
     Differentiable: visibility, lobes.
     """
     sh.check_order(order)
     bands = order if bands is None else bands
     check.choice("bands", bands, range(1, order + 1))
     check.shape("lobes", lobes.shape, visibility.shape)
-    device, (batch_count, vertex_count, _) = visibility.device, visibility.shape
+    device, (batch_count, receiver_count, _) = visibility.device, visibility.shape
     lanes = lane_count(device)
-    row_count = batch_count * block_count(vertex_count, lanes)
+    row_count = batch_count * block_count(receiver_count, lanes)
 
     def add_product(first: wp.array, second: wp.array, table: ProductTable, total: wp.array) -> None:
         launch(
@@ -274,7 +274,7 @@ def sh_product(visibility: wp.array, lobes: wp.array, *, order: int, bands: int 
     return differentiable(
         lambda transfer: add_product(visibility, lobes, product_table(order, str(device), None, bands), transfer),
         adjoint,
-        result=zeros((batch_count, vertex_count, bands**2), dtype=wp.float32, device=device),
+        result=zeros((batch_count, receiver_count, bands**2), dtype=wp.float32, device=device),
         variables=[visibility, lobes],
     )
 
@@ -331,25 +331,25 @@ def _transfer_directions(
     transfer: wp.array3d(dtype=Chunk),
 ):
     """A thread owns a receiver."""
-    batch, vertex = split_row(first_row + wp.tid(), normals.shape[1])
-    nx, ny, nz = broadcast_normal(normals[batch, vertex])
+    batch, receiver = split_row(first_row + wp.tid(), normals.shape[1])
+    nx, ny, nz = broadcast_normal(normals[batch, receiver])
     for chunk in range(directions.shape[1]):
         x = directions[0, chunk]
         y = directions[1, chunk]
         z = directions[2, chunk]
-        t = transmittance[batch, vertex, chunk]
-        transfer[batch, vertex, chunk] = transfer_chunk(weight, nx, ny, nz, x, y, z, t)
+        t = transmittance[batch, receiver, chunk]
+        transfer[batch, receiver, chunk] = transfer_chunk(weight, nx, ny, nz, x, y, z, t)
 
 
 def directional_transfer(transmittance: wp.array, normals: wp.array, directions: np.ndarray) -> wp.array:
     """Transfer vectors to light in cells of directions: T_q max(n·ω_q, 0) · (4π/Q) / π.
 
     Args:
-        transmittance: Float32 of shape [batch, vertex, direction].
-        normals: Unit normals, vec3 of shape [batch, vertex].
+        transmittance: Float32 of shape [batch, receiver, direction].
+        normals: Unit normals, vec3 of shape [batch, receiver].
         directions: Unit vectors ω, NumPy of shape [direction, 3].
     Returns:
-        Transfer vectors, float32 of shape [batch, vertex, direction].
+        Transfer vectors, float32 of shape [batch, receiver, direction].
     Differentiable: transmittance, normals.
     """
     inputs, device = prepare_cells(transmittance, normals, directions), normals.device

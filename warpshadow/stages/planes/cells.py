@@ -13,14 +13,12 @@ distance d below the receiver:
 The plane covers the part h of the cell that is within its outline (:mod:`warpshadow.stages.cell_coverage`); where edges
 are many, the part within its rectangle times the mesh's share of the footprint, by texels.
 
-Radiosity is bilinear in two mip levels of the grid. They are blended so that texels are half as wide as the footprint,
-t ρ / √c′, the geometric mean of both its axes. With texels as wide as the footprint, bilinear means would reach twice
-as far as the cell.
+Radiosity is bilinear in two mip levels of the grid, blended so that texels are half as wide as the footprint t ρ / √c′,
+the geometric mean of both its axes: bilinear means reach twice as far. (Under the roof of a barn the light of the
+ground is 7% too strong, with texels as wide as the footprint 17 to 23%.)
 
 No receiver is nearer to a side than a margin, so that t is not 0. :mod:`.fronts` says which side a receiver is on; by
 height alone the weight of the front falls from 1 in the plane to 0 a margin below it, where the back has 1.
-
-Under the roof of a barn the light of the ground is then 7% too strong, with texels as wide as the footprint 17 to 23%.
 """
 
 import functools

@@ -3,9 +3,8 @@
     h_q = Σ_k h_qk,  μ_q = Σ_k μ_qk
 
 h_qk and μ_qk are the coverage of cell q by plane k (:mod:`warpshadow.stages.cell_coverage`). Plane blockers that share
-a cell mostly meet in it, as walls do, and cover different parts of it.
-
-So a cow over a ground is 0.7% off in direct light, with a large sphere in place of the plane 2.3%.
+a cell mostly meet in it, as walls do, and cover different parts of it. (A cow over a ground is 0.7% off in direct
+light, with a large sphere in place of the plane 2.3%.)
 """
 
 import numpy as np
@@ -197,8 +196,8 @@ def plane_coverage(
     Returns:
         vec4 of shape [batch, receiver, direction], for :func:`warpshadow.stages.joint_coverage.transmittance_past`; h
         is 1 or more where nothing passes. None where no plane casts a shadow on them.
-    Differentiable: points, frames, front_weights. Not: horizon_normals, which decide by steps,
-    and how much receivers in a plane see of a cell.
+    Differentiable: points, frames, front_weights. Not: horizon_normals, which decide by steps, and how much receivers
+    in a plane see of a cell.
     """
     check_planes(planes, points, frames, directions, skip)
     count = common_batch({"points": points, "frames": frames, "front_weights": front_weights})

@@ -4,27 +4,27 @@ Where bodies touch, a receiver may lie in the plane of another body, where its o
 
     front = S(b + (1 − b²) n·N + 2 h / m),  b = (u + l) / max(u − l, m), from −1 to 1
 
-h is the receiver's height above the plane, n its normal, and N the plane's normal. The receiver's body lies between the
-heights l and u. S is the smoothstep from 0 at −1 to 1 at 1, and m the plane's margin, a thousandth of a texel.
+h is the receiver's height above the plane, n its normal, N the plane's; the receiver's body lies between the heights l
+and u. S is the smoothstep from 0 at −1 to 1 at 1, and m the plane's margin, a thousandth of a texel.
 
 - Body in front of the plane (b = 1), or behind it (b = −1): all its receivers are on that side.
-- Body that the plane cuts: the height h of each receiver decides.
+- Body that the plane cuts: the height h of each receiver decides. It has no gradient: over the short margin that would
+  be hundreds of times the gradients of other receivers.
 - Body in the plane (b = 0, h = 0): its normals decide.
 
-The height term has no gradient: over the short margin it would be hundreds of times the gradients of other receivers.
-
-A receiver on the line where two planes meet would lie in both. Seen edge-on, neither would cover the half of the sky
-that it hides. So receivers nearer than 2 k to a plane, k = 5 m, are moved off it, by k at most, before they are lit:
+Receivers nearer than 2 k to a plane, k = 5 m, are moved off it, by k at most, before they are lit:
 
     x + Σ_f (2 front_f − 1) k (1 − (h_f / 2 k)²)² N_f
+
+(On the line where two planes meet a receiver would lie in both, and neither, seen edge-on, would cover the half of the
+sky that it hides.)
 
 A patch sample is on the side of the sphere that is nearest to its patch, of radius r, with its center at the height c:
 
     front = S(1.25 (h + c) / r)
 
-So a sphere that touches a plane from above has all its patch samples in front, even if the body has sunk into the
-ground a little. 1.25 leaves room for spheres that bulge out of their mesh. The light of a patch sample changes over the
-depth of a sphere, then, not of a margin.
+So a sphere on a plane has all its patch samples in front, even if the body has sunk into the ground a little; its light
+changes over the depth of a sphere, not of a margin. 1.25 leaves room for spheres that bulge out of their mesh.
 """
 
 from __future__ import annotations
@@ -241,8 +241,7 @@ def find_fronts(
     """Weight of each plane's front for each receiver, and receivers lifted off planes in which they lie.
 
     Args:
-        points: The receivers [scene units], vec3 of shape [batch, receiver].
-        normals: Their unit normals, vec3 of shape [batch, receiver].
+        points, normals: Receivers [scene units] and their unit normals, vec3 of shape [batch, receiver].
         body_sides: From :func:`find_body_sides`, float32 of shape [batch, body, plane]. None where it is not known:
             receivers are in front down to the plane itself.
         spheres: The blockers nearest to patch samples; None where no receiver is one.

@@ -126,8 +126,7 @@ def find_grid(
     """Find the grid of a body that lies in a plane, over its smallest rectangle.
 
     Args:
-        positions: Vertices [units of the body], shape [vertex, 3].
-        faces: Faces that wind alike, shape [face, 3].
+        positions, faces: Vertices [units of the body], shape [vertex, 3], and faces that wind alike, [face, 3].
         is_two_sided: Whether the back sends light, too.
         others: Points of the scene's other bodies, in this body's frame, shape [point, 3]: texels are small near them.
             None for an even grid.

@@ -384,8 +384,7 @@ def _resolve_layers(
 def rasterize(clip_positions: wp.array, faces: wp.array, width: int, height: int) -> Fragments:
     """Find the face that each sample sees, and where on that face.
 
-    A face is drawn where it holds a sample's center, however small it is, where 0 < z <= w (between the near
-    plane and infinity); a face without area draws nothing.
+    A face is drawn where it holds a sample's center, and 0 < z <= w (between the near plane and infinity).
 
     Args:
         clip_positions: Vertices in clip space, of :func:`warpshadow.stages.raster.project.to_clip`, vec4, shape [batch,

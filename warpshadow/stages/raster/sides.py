@@ -1,9 +1,8 @@
 """Sides: whether samples see a face from the front, where its corners run counter-clockwise, or from behind.
 
-An open surface shows both, and each has a light of its own: that of normals which point to where it is seen from. So
-sides have numbers. Of F faces, face f is side f from the front, and side F + f from behind; likewise vertex v of V is
-number v, with its normal, and number V + v, with the opposite one. The corners of side F + f are the corners of f, plus
-V.
+An open surface shows both, and each has a light of its own, by normals that point to where it is seen from. Of F faces,
+face f is side f from the front, and side F + f from behind; likewise vertex v of V is number v, with its normal, and
+number V + v, with the opposite one. The corners of side F + f are the corners of f, plus V.
 """
 
 from dataclasses import replace

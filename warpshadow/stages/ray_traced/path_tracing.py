@@ -269,12 +269,9 @@ def trace_bounces(
     at receivers.
 
     Args:
-        surfaces: The surfaces it bounces from.
-        points: Receiver positions [scene units], vec3 of shape [receiver].
-        normals: Unit normals, vec3 of shape [receiver].
+        points, normals: Receivers [scene units] and their unit normals, vec3 of shape [receiver].
         samples: Directions drawn from the light; each hit takes one of all the sets.
         bounces: Most bounces of a path, 1 or more.
-        paths: Number of paths from each receiver.
         shell: As for :func:`.trace_shading`.
     Returns:
         The bounced light that white surfaces send back, vec3 of shape [receiver].

@@ -7,10 +7,10 @@ With directions ω_i and the light l_i that each stands for (:func:`.light_sampl
 Some receivers tell where light comes from, so that most directions go there (:func:`find_shares`).
 Rays go through the scene in packets of 16 that are close to each other (:mod:`.ray_packets`).
 
-Neighbors in an image mostly see the same light. So all rays of receivers at the corners of squares of pixels are traced
-(:func:`find_corners`). Receivers within a square take over the visibility on which its corners agree, interpolate the
-visibility of doubtful rays that bring little light, and trace the others. So edges of shadows are as sharp as if all
-were traced; but a shadow that falls between the corners is missed.
+Neighbors in an image mostly see the same light. So all rays are traced at the corners of squares of pixels alone
+(:func:`find_corners`). Receivers within a square take over the visibility on which its corners agree, interpolate that
+of doubtful rays that bring little light, and trace the others. Edges of shadows are as sharp as if all were traced, but
+a shadow that falls between the corners is missed.
 """
 
 import functools
@@ -166,7 +166,6 @@ def find_shares(
     """Find the share of receivers' light that comes from each direction, on average over dim and bright receivers.
 
     Args:
-        tree: The blockers.
         points: Receiver positions [scene units], vec3 of shape [receiver]; a few stand for all.
         normals: Unit normals, vec3 of shape [receiver].
         samples, shell: As for :func:`trace_shared`.
@@ -213,13 +212,10 @@ def trace_shared(
     """Trace the shading of receivers: the radiance of a white surface in direct light.
 
     Args:
-        tree: The blockers.
-        points: Receiver positions [scene units], vec3 of shape [receiver].
-        normals: Unit normals, vec3 of shape [receiver].
+        points, normals: Receivers [scene units] and their unit normals, vec3 of shape [receiver].
         samples: One set of directions, a multiple of 16, each run of 16 close to each other.
         shell: As for :func:`warpshadow.stages.rays.ray_tracing.trace_shading`.
         corners: Receivers around others, whose visibility they take over; None for none.
-        progress: Show a progress bar where it takes longer than a second.
 
     Returns:
         Shading, vec3 of shape [receiver].
@@ -251,12 +247,7 @@ def trace_shared(
 def find_corners(receivers: Receivers, instance: int, supersampling: int) -> Corners:
     """Find the receivers at the corners of the squares of pixels that receivers of an image are in.
 
-    A receiver has corners if all of them lie on one smooth surface with it.
-
-    Args:
-        receivers: Of samples.
-        instance: Which of their views.
-        supersampling: Samples of a pixel across and down.
+    A receiver of a sample has corners if all of them lie on one smooth surface with it.
     """
     count = receivers.points.shape[1]
     corners = Corners.none(count)

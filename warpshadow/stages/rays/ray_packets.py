@@ -224,9 +224,7 @@ def make_find_open() -> wp.Function:
         """Find which rays of a packet meet no face.
 
         Args:
-            tree: The faces.
             point, normal: The receiver; none of these rays goes below its horizon.
-            ray_directions: Directions of the rays.
             facing_rays: Bits of the rays to trace, which are above the horizon.
             last_face: A face that is likely to block them, −1 for none.
         Returns:

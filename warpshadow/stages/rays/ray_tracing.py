@@ -176,13 +176,13 @@ def _trace_visibility(
 ):
     """Each thread owns one ray: a receiver and a direction."""
     row, direction = wp.tid()
-    batch, vertex = split_row(first_row + row, points.shape[1])
-    normal = normals[batch, vertex]
+    batch, receiver = split_row(first_row + row, points.shape[1])
+    normal = normals[batch, receiver]
     ray_direction = directions[direction]
     is_seen = wp.uint8(0)
-    if wp.dot(normal, ray_direction) > 0.0 and escapes(mesh, points[batch, vertex], normal, ray_direction):
+    if wp.dot(normal, ray_direction) > 0.0 and escapes(mesh, points[batch, receiver], normal, ray_direction):
         is_seen = wp.uint8(1)
-    visibility[batch, vertex, direction] = is_seen
+    visibility[batch, receiver, direction] = is_seen
 
 
 def trace_visibility(mesh: wp.Mesh | None, points: wp.array, normals: wp.array, directions: wp.array) -> wp.array:
@@ -192,16 +192,16 @@ def trace_visibility(mesh: wp.Mesh | None, points: wp.array, normals: wp.array, 
 
     Args:
         mesh: The blockers, one mesh for all batches; build it once, it holds the hierarchy. None for nothing.
-        points: Receiver positions [scene units], vec3, shape [batch, vertex].
-        normals: Unit normals of the receivers, vec3, shape [batch, vertex].
+        points: Receiver positions [scene units], vec3, shape [batch, receiver].
+        normals: Unit normals of the receivers, vec3, shape [batch, receiver].
         directions: Unit directions toward the light, vec3, shape [direction].
     Returns:
-        1 where the ray escapes, else 0; uint8, shape [batch, vertex, direction].
+        1 where the ray escapes, else 0; uint8, shape [batch, receiver, direction].
     Raises:
         ValueError: naming the argument whose shape or value does not fit.
     Differentiable: no.
     """
-    check.shape("points", points.shape, ("batch", "vertex"))
+    check.shape("points", points.shape, ("batch", "receiver"))
     check.shape("normals", normals.shape, points.shape)
     check.shape("directions", directions.shape, ("direction",))
     visibility = empty(points.shape + directions.shape, dtype=wp.uint8, device=points.device)
@@ -213,7 +213,7 @@ def trace_visibility(mesh: wp.Mesh | None, points: wp.array, normals: wp.array, 
 def trace_visibility_on_host(
     mesh: wp.Mesh | None, points: np.ndarray, normals: np.ndarray, directions: np.ndarray, device: wp.DeviceLike
 ) -> np.ndarray:
-    """Trace as :func:`trace_visibility` does, of NumPy arrays of one instance: bool of shape [vertex, direction]."""
+    """Trace as :func:`trace_visibility` does, of NumPy arrays of one instance: bool of shape [receiver, direction]."""
     point_array, normal_array, direction_array = (
         wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals, directions)
     )

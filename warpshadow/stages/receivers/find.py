@@ -32,9 +32,11 @@ class Receivers(NamedTuple):
     """Receivers of every instance.
 
     The first receivers are vertices of static bodies: they have indices, but no points and normals here. The others are
-    vertex receivers, then sample receivers. ``faces`` has three receivers a row: rows of the mesh's faces, or sides; a
-    row (r, r, r) for each sample receiver r; the triangles in which samples interpolate. ``fragments`` name these rows
-    in place of the mesh's faces; a side of −1 is no receiver.
+    vertex receivers, then sample receivers.
+
+    ``faces`` has three receiver numbers a row: first a row for each face of the mesh (or each side); then a row
+    (r, r, r) for each sample receiver r; then the triangles between samples. A fragment's face number is a row of it,
+    −1 for none.
     """
 
     points: wp.array  # [batch, receiver − on static] vec3
@@ -260,9 +262,9 @@ def find_receivers(
         positions: Vertices [scene units], vec3 of shape [batch, vertex].
         normals: Unit normals of the vertices, vec3 of shape [batch, vertex].
         faces: Vertex indices, vec3i of shape [face].
-        fragments: The fragments, one batch for all or one each.
-        numbering: The vertices that are receivers: all vertices of a face that a sample sees, unless the face wants
-            samples; with their backs where fragments have sides.
+        fragments: Of one batch for all, or of one each.
+        numbering: The vertices that are receivers: those of faces that a sample sees, unless the face wants samples;
+            with their backs where fragments have sides.
         wants_samples: Faces whose samples have receivers of their own, bool of shape [face].
         bodies: Body of each face, −1 for faces that need not be told apart, shape [face]; None where all share their
             blockers, as for :func:`number_receivers`.
@@ -270,8 +272,8 @@ def find_receivers(
         quadtree: Squares in which samples of faces that want them interpolate; None for none.
         smooth_pieces: Smooth piece of each face, int32 of shape [face], where samples that see different faces of one
             share a receiver, too; None where they do not.
-        rises: Whether receivers of samples, from which rays leave, are lifted from their flat faces onto the curved
-            surface that the vertex normals describe.
+        rises: Whether receivers of samples, from which rays leave, are lifted from flat faces onto
+            the curved surface that the vertex normals describe.
         has_mean_slope, shares_receivers: As for :func:`.sample_receivers.find_sample_receivers`.
         footprint_inputs: By which those of samples have footprints; None where all are points.
     Returns:
@@ -384,8 +386,7 @@ def receivers_on_faces(
     """Make receivers of given points on faces, for light alone: no image gets it from them.
 
     Args:
-        positions: Vertices [scene units], vec3 of shape [batch, vertex].
-        normals: Unit normals of the vertices, vec3 of shape [batch, vertex].
+        positions, normals: Vertices [scene units] and their unit normals, vec3 of shape [batch, vertex].
         faces: Vertex indices, vec3i of shape [face].
         sides: Faces, from the front or from behind, int of shape [receiver].
         barycentrics: Where on them, shape [receiver, 3].

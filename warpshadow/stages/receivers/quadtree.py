@@ -1,15 +1,14 @@
 """Quadtree: receivers at the corners of squares of the image, which are small where light changes quickly.
 
-On a body that lies in a plane light changes slowly over the image, but for the edges of shadows. So its receivers are
-the fragments at the corners of squares of 4 × 4 pixels, and squares are cut into four where the light that samples
-interpolate differs from their own (Ward's irradiance caching, in the image). *Probes* tell that: samples at every
-second pixel, or in small images at every one, whose light the caller estimates. In a square of corners a b / c d are
-two triangles a b c and d c b, in which samples interpolate linearly.
+On a body that lies in a plane light changes slowly over the image, but for the edges of shadows. Its receivers are the
+fragments at the corners of squares of 4 × 4 pixels; a square is cut into four where the light that samples interpolate
+differs from their own (Ward's irradiance caching, in the image). *Probes* tell that: every second pixel, or in small
+images every one, whose light the caller estimates. In a square of corners a b / c d samples interpolate linearly in the
+triangles a b c and d c b.
 
 A square is *accepted* if its corners see one side of one body, and samples within it would be off by less than the
-tolerance. Samples within it that see another side, or whose pixel is in no accepted square, are receivers themselves.
-
-(Were these in squares of a pixel instead, the ground of a barn would be 26% off, not 12%.)
+tolerance. Samples that see another side, or are in no accepted square, are receivers themselves. (In squares of a pixel
+instead, the ground of a barn would be 26% off, not 12%.)
 """
 
 import functools
@@ -58,7 +57,6 @@ def probe_grid(size: tuple[int, int], supersampling: int) -> tuple[np.ndarray, n
 
     Args:
         size: Height and width of the image [samples].
-        supersampling: Samples of a pixel across and down.
     """
     spacing = probe_spacing(size, supersampling)
     counts = (MAX_SIDE // spacing * -(-length // (supersampling * MAX_SIDE)) + 1 for length in size)
@@ -198,7 +196,6 @@ def find_quadtree(
         keys: A number for each side, equal for sides in one plane, −1 for sides without squares.
         probe_shares: Light at the samples of :func:`probe_grid`, over that where nothing blocks any, float32 of shape
             [view, row, column]; anything where they see no side that has squares.
-        supersampling: Samples of a pixel across and down.
         tolerance: Error of interpolation at which a square is cut, in the unit of the shares.
     """
     device, (view_count, height, width) = sides.device, sides.shape

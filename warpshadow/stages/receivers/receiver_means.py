@@ -187,7 +187,6 @@ def mean_fragments(
         owner_samples: The sample that owns the receiver of each, int32 of shape [view, sample].
         is_corner: Whether each is at the corner of a square, bool of the same shape; None without squares.
         samples: The sample that owns each receiver, −1 for none, int32 of shape [view, receiver].
-        supersampling: Samples of a pixel across and down.
         has_mean_slope: As for :func:`.sample_receivers.find_sample_receivers`.
     Returns:
         Sides and barycentrics, of shape [view, receiver].

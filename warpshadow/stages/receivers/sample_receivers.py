@@ -1,10 +1,12 @@
 """Sample receivers: points that samples see, at which light is evaluated for them.
 
-Samples of a pixel that see the same side share one, at the mean of their points: of four samples, 1.1 to 1.5 receivers
-a pixel. On bodies that shine each sample has its own, but by rays: means leap as samples pass to the next face, and
-narrow highlights with them. In stills samples of different faces share one, too, if these belong to one smooth piece
-and the surface is even: shared by two slats of a bench, it would lie in the gap. In squares of a quadtree there is one
-at each corner, and samples interpolate in triangles of these.
+- Samples of a pixel that see the same side share one, at the mean of their points: of four samples, 1.1 to 1.5
+  receivers a pixel.
+- On bodies that shine each sample has its own, but by rays: means leap as samples pass to the next face, and narrow
+  highlights with them.
+- In stills samples of different faces share one, too, if these belong to one smooth piece and the surface is even:
+  shared by two slats of a bench, it would lie in the gap.
+- In squares of a quadtree there is one at each corner, and samples interpolate in triangles of these.
 """
 
 import functools
@@ -95,11 +97,15 @@ def _find_owner_samples(
     weights: wp.array2d(dtype=wp.vec3),
     is_owner: wp.array2d(dtype=wp.bool),
 ):
-    """A thread owns a run of pixels of a row.
+    """A thread owns a run of pixels of a row: it finds where each sample has its light, and the weights there.
 
-    A sample gets the owner of its receiver, the first sample that shares it, −1 if its receivers are vertices, or
-    −2 − t in a triangle t; and the weights of its receivers. A corner of squares is at its sample, so others do not
-    share it.
+    | owner sample | light of the sample |
+    | --- | --- |
+    | ≥ 0 | of the receiver that this sample owns, the first of those that share it |
+    | −1 | interpolated between the vertices of the face |
+    | −2 − t | interpolated in triangle t |
+
+    A corner of squares is at its sample, so others do not share it.
     """
     view, thread = split_row(first_row + wp.tid(), sides.shape[1] // (supersampling * supersampling) // run)
     pixels = width // supersampling
@@ -234,7 +240,6 @@ def find_sample_receivers(
         side_count: Faces that receivers at vertices have.
         wants_samples: Faces whose samples have receivers, bool of shape [face].
         bodies: Body of each face, −1 for faces that need not be told apart, shape [face].
-        supersampling: Samples of a pixel across and down.
         quadtree: Squares at whose corners there are receivers; None for none.
         surface: Visible surface of one instance, where samples of a pixel share a receiver if they see different faces
             of one smooth surface, too; None where they do not.
@@ -336,7 +341,6 @@ def places_in_pixels(samples: wp.array, width: int, supersampling: int) -> wp.ar
     Args:
         samples: The samples, int32 of shape [batch, receiver].
         width: Samples of an image in a row.
-        supersampling: Samples of a pixel across and down.
     """
     places = empty(samples.shape, dtype=wp.int32, device=samples.device)
     launch(_find_places, samples.shape, inputs=[samples, width, supersampling], outputs=[places])
@@ -367,7 +371,6 @@ def _number_by_body(
 
     Args:
         views, ranks: View and body of each receiver.
-        view_count, body_count: Numbers of them.
     Returns:
         The number of each; and where the bodies begin, and the last ends.
     """
@@ -384,7 +387,6 @@ def fragments_of_samples(fragments: Fragments, samples: np.ndarray) -> Fragments
     """Select the fragments of some samples: sides and barycentrics [view, sample], without a gradient.
 
     Args:
-        fragments: The fragments of all samples.
         samples: Which, int of shape [view, sample], −1 for none.
     """
     sides = rows(fragments.face_ids if fragments.sides is None else fragments.sides)

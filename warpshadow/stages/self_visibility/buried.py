@@ -91,7 +91,6 @@ def find_dilation(probes: VisibilityProbes, is_buried: np.ndarray) -> np.ndarray
     """Find the row from which each row copies visibility: itself, or its nearest unburied neighbor along edges.
 
     Args:
-        probes: The probes.
         is_buried: Bool of shape [row]: the probes, and their backs if they have any.
     Returns:
         Numbers of rows, int of shape [row]. A buried row from which no way leads to another kind keeps its own.

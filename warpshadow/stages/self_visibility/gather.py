@@ -297,10 +297,6 @@ def gather_self_transmittance(
 
     Args:
         normals: Unit normals of the receivers, vec3 of shape [batch, receiver].
-        probe_weights: Where they lie on the body.
-        resampling_weights: Lookups of the cells of directions.
-        kernels: Kernels of these weights.
-        rows: Visibility of the probes.
     Returns:
         Transmittance T_self in [0, 1], float32 of shape [batch, receiver, direction].
     Differentiable: weights of probe_weights and of resampling_weights. Not: normals (they only cut off directions

@@ -6,9 +6,9 @@ World direction ω is direction d = Rᵀω / |Rᵀω| of the body. It reads the 
 
 c_k the directions of rays or coarse cells, and S_k whether they are open. The weights are C¹ in R.
 
-h follows the light. Weights have a mean squared angle of h²/4, and the cells under them have ρ²/2, where ρ = 2/√C is
-the radius of one of C cells; an evenly bright cap of half-angle s has s²/2. So h² = 2 (s² − ρ²). A cell with a sun so
-looks at few rays, an evenly bright one at some 6 coarse cells. h is at least 2.2 ρ, so that something is always near.
+h follows the light: mean squared angles are equated. Weights have h²/4; the table's cells already blur by ρ²/2, where
+ρ = 2/√C is the radius of one of C cells; an evenly bright cap of half-angle s has s²/2. So h² = 2 (s² − ρ²), and at
+least 2.2 ρ, so that something is always near: a cell with a sun looks at few rays, an even one at some 6 coarse cells.
 """
 
 from typing import NamedTuple
@@ -188,8 +188,6 @@ def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingK
 
     Args:
         rotations: R of each body, mat33 of shape [batch, body].
-        body: Index of the body.
-        kernels: Of the cells.
     Differentiable: rotations.
     """
     shape = len(rotations), kernels.directions.size

@@ -1,10 +1,9 @@
 """Probes: the points of a body at which self-visibility is tabulated, and the interpolation between them.
 
 Probes are the body's vertices and, where edges are long, points between them: light changes along a rail that has no
-vertex between its ends. Faces are cut at the middle of their longest edge, and so are their pieces, until no edge is
-longer than is wanted, nor cut by the face beside it (Rivara 1984), so faces agree. The visibility of a
-sample is interpolated between the corners of its piece. The first probes are the vertices; the backs of all probes of
-an open body follow.
+vertex between its ends. Faces and their pieces are cut at the middle of their longest edge until no edge is too long,
+nor cut by the face beside it, so that faces agree (Rivara 1984). The visibility of a sample is interpolated between the
+corners of its piece. The first probes are the vertices; the backs of all probes of an open body follow.
 """
 
 from collections.abc import Callable
@@ -20,21 +19,17 @@ from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.sides import split_side
 
 _EVEN_FACES = 10_000
-"""Faces of the even cut by which edges are judged, so that it resolves visibility between probes: 507 vertices alone
-lose 3.5%.
-"""
+"""Edges are judged by those of an even cut of the surface into so many faces (507 vertices alone lose 3.5%)."""
 
-_MAX_SAMPLE_EDGE = 1.2  # longest edge where samples receive, in edges of that even cut
+_MAX_SAMPLE_EDGE = 1.2  # longest edge where samples receive, in edges of the even cut
 
-_MAX_VERTEX_EDGE = 4.0
-"""Longest edge where only vertices receive: probes between them are there for vertices that are buried …"""
+_MAX_VERTEX_EDGE = 4.0  # likewise where only vertices receive; probes between them are for buried vertices
 
-_SLIVER_RATIO = 3.0  # … and only on edges longer than a third of all edges by this factor: on edges of slivers
+_SLIVER_RATIO = 3.0  # there an edge is cut only if it is longer than 3 × the ⅓-quantile of edges: those of slivers
 
 _ENTRY_RATIO = 1 / 3
-"""Longest edge that enters another part of the body, as a spoke a hub, over that of others. Images of the cage and of
-the chair, wheel and fence of demos/kinds.py are 7.1 and 5.1% off with 1/3, 7.5 and 5.5% with 1; with 1/8 there are so
-many that probes elsewhere are missing."""
+"""Longest edge that enters another part of the body, as a spoke a hub, over that of others (demos/kinds.py, cage, and
+chair, wheel and fence: 7.1 and 5.1% off; with 1: 7.5 and 5.5%; with 1/8 probes elsewhere are missing)."""
 
 _MAX_PROBES = 2**14  # probes of a body at most, as long as it has fewer than half as many vertices
 _LENGTH_STEP = 1.3  # how much longer edges may be at each try to have fewer probes

@@ -39,7 +39,6 @@ def project_rows(rows: VisibilityRows, normals: np.ndarray, order: int) -> wp.ar
     Args:
         rows: Visibility of the probes past their body.
         normals: Their unit normals in the frame of the body [row, 3]; a zero normal has no lobe.
-        order: Number of SH bands n.
     Returns:
         L, float32 of shape [row, order²]. Not differentiable.
     """
@@ -263,10 +262,6 @@ def self_visibility_lobes(
 
     Args:
         lobes: L of its probes, float32 of shape [row, order²].
-        probe_weights: Of the receivers, among the probes of the body.
-        rotation: Of the body.
-        order: Number of SH bands n.
-        bands: Number of bands to be found; all by default.
     Returns:
         K, float32 of shape [batch, receiver, bands²].
     Differentiable: the body's rotation, as it turns on; weights of the probes.

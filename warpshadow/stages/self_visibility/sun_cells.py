@@ -130,11 +130,7 @@ def trace_sun_cells(
     """Trace the self-visibility of a body's receivers in sun cells.
 
     Args:
-        probes: Of the body.
-        probe_weights: Where the receivers lie among them.
         rotations: R of each body, mat33 of shape [batch, body].
-        body: Index of the body.
-        cells: The sun cells.
     Returns:
         Transmittance in [0, 1], float32 of shape [batch, receiver, 16].
     Differentiable: no.

@@ -57,12 +57,12 @@ def _find_exits(
 ):
     """A thread owns a ray: the root of |x + t ω − c| = R in front of it."""
     batch, receiver, i = wp.tid()
-    own_shell = shell[instance_in(batch, shell.shape[0])]
+    instance_shell = shell[instance_in(batch, shell.shape[0])]
     point = points[instance_in(batch, points.shape[0]), receiver, instance_in(i, points.shape[2])]
-    offset = point - center_of(own_shell)
+    offset = point - center_of(instance_shell)
     direction = directions[instance_in(batch, directions.shape[0]), receiver, i]
     projection = wp.dot(offset, direction)
-    square = projection * projection - wp.dot(offset, offset) + own_shell[3] * own_shell[3]
+    square = projection * projection - wp.dot(offset, offset) + instance_shell[3] * instance_shell[3]
     exits[batch, receiver, i] = wp.normalize(offset + (wp.sqrt(wp.max(square, 0.0)) - projection) * direction)
 
 

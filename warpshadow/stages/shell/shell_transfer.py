@@ -89,14 +89,14 @@ def _find_transfer(
 ):
     """A thread owns a receiver."""
     batch, receiver = split_row(first_row + wp.tid(), transfer.shape[1])
-    own_shell = shell[instance_in(batch, shell.shape[0])]
+    instance_shell = shell[instance_in(batch, shell.shape[0])]
     point = points[batch, receiver]
     normal = normals[batch, receiver]
-    offset = center_of(own_shell) - point
-    area = 4.0 * wp.pi / float(patches.shape[0]) * own_shell[3] * own_shell[3]
+    offset = center_of(instance_shell) - point
+    area = 4.0 * wp.pi / float(patches.shape[0]) * instance_shell[3] * instance_shell[3]
     for k in range(patches.shape[0]):
         patch_direction = patches[k]
-        beam = offset + own_shell[3] * patch_direction
+        beam = offset + instance_shell[3] * patch_direction
         value = float(0.0)
         if wp.dot(normal, beam) > 0.0 and wp.dot(patch_direction, beam) > 0.0:
             value = _form_factor(beam, normal, patch_direction, area)
@@ -138,11 +138,11 @@ def _find_transfer_adjoint(
     """
     batch, receiver = split_row(first_row + wp.tid(), adj_transfer.shape[1])
     shell_batch = instance_in(batch, shell.shape[0])
-    own_shell = shell[shell_batch]
+    instance_shell = shell[shell_batch]
     point = points[batch, receiver]
     normal = normals[batch, receiver]
-    offset = center_of(own_shell) - point
-    radius = own_shell[3]
+    offset = center_of(instance_shell) - point
+    radius = instance_shell[3]
     area = 4.0 * wp.pi / float(patches.shape[0]) * radius * radius
     adj_normal = wp.vec3()
     adj_center = wp.vec3()

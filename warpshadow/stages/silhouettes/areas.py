@@ -8,21 +8,24 @@ lies beyond it
         0                         t ≥ (1 + m)/2
 
 The line of an edge with ends a, b is ℓ = a × b, and that where two faces intersect ℓ = n − n′, the difference of their
-planes. If the outline of a surface moves by v(s), an integral of g over it changes by ∮ g (v_x dy − v_y dx). So an edge
-counts, in each row that it crosses, by the motion of its point along the row, and in each column by that along the
+planes.
+
+**Edges.** If the outline of a surface moves by v(s), an integral of g over it changes by ∮ g (v_x dy − v_y dx). So an
+edge counts, in each row that it crosses, by the motion of its point along the row, in each column by that along the
 column, with 1 in place of ω:
 
     dx = α da_x + β db_x, on screen         α, β: the point on the edge is α a + β b in clip space, scaled to w = 1
 
 Between two neighbors of which one sees the surface there is an odd number of edges. One of them is found; the others
-cancel in pairs, since they move alike. By the edge's normal, dx = (α ℓ·da + β ℓ·db) / ℓ_x, they would not: along a
-border with teeth of a sample gradients had the wrong sign. A line where faces intersect has no points that move with
-it, so it counts by its normal, with ω:
+cancel in pairs, since they move alike. (By the edge's normal they would not: along a border with teeth of a sample
+gradients had the wrong sign.)
+
+**Intersections** have no points that move with the line, so they count by its normal, with ω:
 
     dx = Σ_i (λ_i u n·dv_i − λ′_i u′ n′·dv′_i) / ℓ_x        λ: barycentrics of the fragments, u: its 1/w
 
-The change of m is left out: on balance it hardly matters to the exchange between two samples (1e-4 of the gradient by a
-rigid motion), and at edges far below a sample it would outweigh the rest, pulling their ends opposite ways.
+The change of m is left out: it hardly matters to the exchange between two samples (1e-4 of the gradient by a rigid
+motion), and at edges far below a sample it would outweigh the rest, pulling their ends opposite ways.
 """
 
 import warp as wp

@@ -89,10 +89,10 @@ def find_edge_colors(
 ) -> wp.array:
     """Find the colors that surfaces have at the edges themselves.
 
-    Shading changes fastest where a surface turns away from the eye: over the last half sample of a ball, by a tenth. So
-    the color of the near surface, which ends at the edge, is interpolated between the edge's vertices. Where these are
-    no receivers, as at a body that is shaded by pixel and so at creases, and on the far surface, which has no vertices
-    there, color is extrapolated linearly from the two nearest samples that see the surface.
+    The color of the near surface, which ends at the edge, is interpolated between the edge's vertices: shading changes
+    fastest where a surface turns away from the eye, over the last half sample of a ball by a tenth. Where these are no
+    receivers, as of a body shaded by pixel, and on the far surface, color is extrapolated linearly from the two nearest
+    samples that see the surface.
 
     Args:
         image: Color and coverage before smoothing, vec4 of shape [batch, height, width].

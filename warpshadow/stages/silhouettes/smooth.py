@@ -7,10 +7,9 @@ the lines and weights ω_k of the lines (:mod:`warpshadow.stages.silhouettes.fin
 
     c + Σ_k e_k (ω_k − Σ_l π_kl max(ω_k + ω_l − 1, 0) e_l) (c_k − c)          l: the two directions across k
 
-which is a mean: the weights are positive, and at most 1 in all. The inner sum is the overlap of two areas: nothing if
-they lie beyond one line, their product if they lie beyond two upright ones. Each of the two loses half of it, π = ½.
-Only if one lies beyond the end of a surface (π = 0) and the other beyond a crease of it (π = 1), the crease's loses all
-of it.
+This is a mean: the weights are positive, and at most 1 in all. The inner sum is the overlap of two areas: nothing if
+they lie beyond one line, their product if beyond two upright ones, of which each loses half, π = ½. If one lies beyond
+the end of a surface (π = 0) and the other beyond a crease of it (π = 1), the crease's loses all of it.
 """
 
 import functools
@@ -160,11 +159,10 @@ def smooth_silhouettes(
             go; by default the colors of samples.
     Returns:
         Smoothed image, like ``image``; a sample lies within the range of itself and its four neighbors.
-    Differentiable: image; clip_positions, exactly on average over where samples lie (an edge counts by the motion of
-    its points, :mod:`warpshadow.stages.silhouettes.areas`); overlaps of areas are left out. Without edge colors an edge
-    has the colors of the samples beside it: where shading changes by δ over a sample there, its gradient is δ/2 off.
-    Excluded are intersections within one surface, cuts by the near plane, and surfaces that leave the image: there is
-    no neighbor to take from.
+    Differentiable: image; clip_positions, exactly on average over where samples lie
+    (:mod:`warpshadow.stages.silhouettes.areas`), but for overlaps of areas, intersections within one surface, cuts by
+    the near plane, and surfaces that leave the image, where there is no neighbor to take from. Without edge colors an
+    edge has the colors of the samples beside it: where shading changes by δ over a sample, its gradient is δ/2 off.
     """
     fragments = silhouettes.fragments
     batch_count, height, width = fragments.face_ids.shape

@@ -91,7 +91,6 @@ def average_over_receivers(scalars: wp.array, face_ids: wp.array, faces: wp.arra
         scalars: Float32 of shape [batch, sample].
         face_ids: Of :attr:`.receivers.Receivers.fragments`, int32 of shape [view, sample].
         faces: Of receivers, vec3i of shape [face].
-        receiver_count: Number of receivers.
     Returns:
         Float32 of shape [batch, receiver], 0 for receivers that are vertices.
     Differentiable: scalars.

@@ -437,7 +437,6 @@ def add_to_texels(adj_texels: wp.array, textures: Textures, footprints: Footprin
 
     Args:
         adj_texels: Gradients of the texels, to which it adds, vec3 of shape [batch, texel].
-        footprints: Of the samples.
         adj_albedo: Gradients of the samples' reflectance, vec3 of shape [batch, height, width].
     """
     inputs = [_make_sample_inputs(textures, footprints), None, rows(adj_albedo), None]

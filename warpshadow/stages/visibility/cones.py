@@ -32,8 +32,8 @@ _BLEND_SLOPE = BLEND * (1 + BLEND) ** -3 / _BLEND_COSINE
 
 
 def check_spheres(points: wp.array, normals: wp.array | None, centers: wp.array, radii: wp.array) -> None:
-    """Raise ValueError unless receivers [batch, vertex] and spheres [batch, sphere] are finite and fit each other."""
-    check.shape("points", points.shape, ("batch", "vertex"))
+    """Raise ValueError unless receivers [batch, receiver] and spheres [batch, sphere] are finite and fit each other."""
+    check.shape("points", points.shape, ("batch", "receiver"))
     if normals is not None:
         check.shape("normals", normals.shape, points.shape)
     check.shape("centers", centers.shape, (points.shape[0], "sphere"))

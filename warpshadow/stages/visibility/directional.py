@@ -6,16 +6,16 @@ falloff, and the opacity A makes up for that: the blocked solid angle is exactly
     T_q(x) = Π_i (1 − A_i smoothstep((u_i·ω_q − lo_i) / (hi_i − lo_i)))
     lo = cos(θ+w),  hi = cos(max(θ−w, 0)),  A = min(1, (1 − cos θ) / (1 − (hi+lo)/2)),  ρ = 2/√Q
 
-w = κρ for receivers that are points. One that stands for an area f² sees the mean over it: an edge at distance d moves
-by an angle of f/d, so then
+There is no band limit, so no ringing; T stays in [0, 1] however many spheres overlap; tiny spheres block as much as
+they should; and the falloff has a smooth gradient.
+
+w = κρ for receivers that are points. One that stands for an area f² sees the mean over it, in which an edge at distance
+d moves by an angle of f/d:
 
     sin²w = sin²κρ + 5/12 f² / (d² + 5/6 f²),   d² = D² − r²
 
-5/12: then a smoothstep has the variance of the mean over a square; 5/6 f² keeps w below 45° where κρ is small. Without
-it an edge narrower than a pixel, as a sun's at the foot of a body, has a derivative at few receivers, and a huge one.
-
-There is no band limit, so no ringing; T stays in [0, 1] however many spheres overlap; tiny spheres block as much as
-they should; and the falloff has a smooth gradient.
+By 5/12 a smoothstep has the variance of the mean over a square; 5/6 f² keeps w below 45° where κρ is small. Otherwise
+an edge narrower than a pixel, as a sun's at the foot of a body, has a huge derivative at few receivers.
 """
 
 import functools
@@ -275,8 +275,8 @@ def transmittance(
     """Transmittance of spheres towards cells of directions.
 
     Args:
-        points: Receiver positions [scene units], vec3 of shape [batch, vertex].
-        normals: Unit normals, vec3 of shape [batch, vertex]: cells below a receiver's horizon, where the cosine is
+        points: Receiver positions [scene units], vec3 of shape [batch, receiver].
+        normals: Unit normals, vec3 of shape [batch, receiver]: cells below a receiver's horizon, where the cosine is
             zero, may be left at 1. None computes it all.
         centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
         radii: Sphere radii [scene units], float32 of shape [batch, sphere]; a radius of 0 blocks nothing.
@@ -287,10 +287,10 @@ def transmittance(
         skip: Spheres that are left out: the first, and the one after the last.
         clusters: Of these spheres, from :func:`.traversal.find_clusters`, where they are found already.
         footprints: Areas f² for which receivers stand, as vectors along the normals of their planes or against them
-            [scene units²], vec3 of shape [batch, vertex]: by their size as the directions see it, on average, the
+            [scene units²], vec3 of shape [batch, receiver]: by their size as the directions see it, on average, the
             falloff is wider; None where receivers are points.
     Returns:
-        Transmittance in [0, 1], float32 of shape [batch, vertex, direction].
+        Transmittance in [0, 1], float32 of shape [batch, receiver, direction].
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii. (That waits for the device. While a CUDA graph
             is captured, nothing is checked.)

@@ -4,14 +4,14 @@ exp*(f) = e^{f0/√4π} exp*(f̂ / 2^p)^{2^p}            [Lyu et al. 2021, secti
 
 Squarings are *held* where they would explode (:mod:`.held_squares`).
 
-The number of squarings is *blended*. p, the least with t = |f̂| / (2^p T) ≤ 1, jumps as |f̂| grows. The value would
-jump with it, by some tenths of a percent, and finite differences of images would be wrong there. For p > 0, t is in
-(½, 1]. From t = ½ on the base approximation q of f / 2^p is blended with the square of q of f / 2^{p+1},
+The number of squarings is *blended*, so that the value does not jump with p, the least with t = |f̂| / (2^p T) ≤ 1 (by
+some tenths of a percent, where finite differences of images would be wrong). For p > 0, t is in (½, 1]. From t = ½ on
+the base approximation q of f / 2^p is blended with the square of q of f / 2^{p+1},
 
     (1 − w) q(f / 2^p) + w q(f / 2^{p+1})²,    w = smoothstep((t − ½) / (BLEND_END − ½))
 
-and from t = BLEND_END on, w = 1. At t = 1, p + 1 squarings take over, at their t = ½ and w = 0, with the same value,
-and v has a continuous derivative. It costs one product more.
+and from t = BLEND_END on, w = 1. At t = 1, p + 1 squarings take over, at their t = ½ and w = 0, with the same value and
+a continuous derivative. It costs one product more.
 """
 
 import functools
@@ -365,22 +365,19 @@ def _make_exponentiate_adjoint(order: int, base: str, lanes: int) -> wp.Kernel:
 
 
 def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float | None = None) -> wp.array:
-    """Exponentiate log-visibility with the SH product, by scaling and squaring.
+    """Exponentiate log-visibility with the SH product, by scaling and squaring (the formula is the module's).
 
-        exp*(f) = e^{f0/√4π} exp*(f̂ / 2^p)^{2^p},  p the least with |f̂| / 2^p ≤ threshold
-                                                     [Lyu et al. 2021, section 3.3.3; Ren et al. 2006, section 5]
-
-    Squarings are held where the result would rise above 1, as where hundreds of spheres overlap (see the module): it is
-    then bounded, and draws a warning.
+    Squarings are held where the result would rise above 1, as where hundreds of spheres overlap: it is then bounded,
+    and draws a warning.
 
     Args:
-        log_sh: Log-visibility f, float32 of shape [batch, vertex, order²], f̂ being f without its constant part.
+        log_sh: Log-visibility f, float32 of shape [batch, receiver, order²], f̂ being f without its constant part.
         base: Approximation of exp*(h) for small h: "quadratic" 1 + h + h²/2, "linear" 1 + h, or "optimal_linear"
             a(|h|) 1 + b(|h|) h with a and b tabulated from caps of all angles.
         threshold: Largest |h|; None for the default of THRESHOLDS[base]. Beyond its limit squaring explodes, so more
             is refused.
     Returns:
-        SH visibility, float32 of shape [batch, vertex, order²].
+        SH visibility, float32 of shape [batch, receiver, order²].
     Raises:
         ValueError: for NaN, Inf and numbers beyond 1e18. (That waits for the device. While a CUDA graph is captured,
             nothing is checked.)
@@ -394,14 +391,14 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
             f"threshold: got {threshold!r} for base {base!r}, expected {MIN_THRESHOLD} to {limit}: beyond it "
             "repeated squaring is unstable, below it drowns in rounding"
         )
-    check.shape("log_sh", log_sh.shape, ("batch", "vertex", "order²"))
+    check.shape("log_sh", log_sh.shape, ("batch", "receiver", "order²"))
     order = int(round(np.sqrt(log_sh.shape[2])))
     sh.check_order(order)
-    check.shape("log_sh", log_sh.shape, ("batch", "vertex", order**2))
+    check.shape("log_sh", log_sh.shape, ("batch", "receiver", order**2))
     device = log_sh.device
     lanes = lane_count(device)
-    batch_count, vertex_count = log_sh.shape[:2]
-    blocks = block_count(vertex_count, lanes)
+    batch_count, receiver_count = log_sh.shape[:2]
+    blocks = block_count(receiver_count, lanes)
     row_count = batch_count * blocks
     scratch = [Scratch((4, order**2), lane_type(lanes))]
     # room for the most squarings; a CPU never touches the memory of squarings that are not done, a GPU reserves all
@@ -438,8 +435,8 @@ def exponentiate(log_sh: wp.array, *, base: str = "quadratic", threshold: float 
             check.finite("log_sh", log_sh.numpy())
         if held_count:
             check.warn(
-                f"log-SH visibility of {held_count} of {batch_count * vertex_count} receivers is held back from rising "
-                "above 1, since many spheres overlap; fewer spheres, or directional transmittance, are accurate"
+                f"log-SH visibility of {held_count} of {batch_count * receiver_count} receivers is held back from "
+                "rising above 1, since many spheres overlap; fewer spheres, or directional transmittance, are accurate"
             )
 
     look_at_values(faults, judge)

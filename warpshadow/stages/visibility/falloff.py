@@ -155,8 +155,6 @@ def make_cap_adjoint(
             share a = A step(t). Slot is the number of the cell among the thread's, direction that among all.
         is_costly: Whether that costs more than the test for cells of which the sphere blocks nothing.
         Task: Struct as for :func:`.culling.make_cull`.
-        lanes: Receivers of a block.
-        has_footprints: Whether receivers have footprints.
 
     Returns:
         The function (receivers, sphere_view, count, task) → SphereAdjoint, and Σ ā a.

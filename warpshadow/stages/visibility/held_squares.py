@@ -1,18 +1,19 @@
 """Held squarings of visibility in spherical harmonics: each stops where it would explode.
 
 Where many spheres overlap, the truncated sum of their logs has lobes above 0, and their exponential has no bound: with
-10 000 spheres in one direction it leaves float64. A visibility v has values from 0 to 1, so the mean of v² over all
-directions is at most the mean of v. Truncation breaks that rule, and d = ⟨v²⟩ − ⟨v⟩, which is then above 0, measures by
-how much. Each squaring is
+10 000 spheres in one direction it leaves float64. A visibility has values from 0 to 1, so the mean of v² over all
+directions is at most the mean of v; truncation breaks that rule by d = ⟨v²⟩ − ⟨v⟩ > 0. Each squaring is
 
     v ← v + w (v * v − v),    w = 1 − smoothstep(log(|f̂| d / SQUARED_BELOW) / log(HELD_ABOVE / SQUARED_BELOW))
 
-While |f̂| d ≤ SQUARED_BELOW, w = 1: v is squared. From HELD_ABOVE on, w = 0: v stays as it is. If k squarings are left
-out, the result is the visibility of f / 2^k. The factor |f̂| grows with the number of spheres that overlap. It stops
-the squarings of such logs earlier; nothing is lost, since such receivers are dark before their last squarings.
-HELD_ABOVE is four times SQUARED_BELOW: one squaring raises d by that factor or more, so w is between 0 and 1 for one
-squaring at a time, and v changes smoothly with f. The rule is cheap: the mean of v² is the first coefficient of the
-product v * v.
+- While |f̂| d ≤ SQUARED_BELOW, w = 1: v is squared. From HELD_ABOVE on, w = 0: v stays as it is. If k squarings are left
+  out, the result is the visibility of f / 2^k.
+- |f̂| grows with the number of spheres that overlap, and stops the squarings of such logs earlier; nothing is lost,
+  since such receivers are dark before their last squarings.
+- HELD_ABOVE is four times SQUARED_BELOW: one squaring raises d by that factor or more, so w is between 0 and 1 for one
+  squaring at a time, and v changes smoothly with f.
+
+The rule is cheap: the mean of v² is the first coefficient of v * v.
 """
 
 import functools

@@ -249,8 +249,8 @@ def accumulate(
         f(x) = Σ_i R(u_i) z(θ_i)                      [Lyu et al. 2021, section 3.3.2]
 
     Args:
-        points: Receiver positions [scene units], vec3 of shape [batch, vertex].
-        normals: Unit normals of the receivers, vec3 of shape [batch, vertex]: spheres below the horizon, which
+        points: Receiver positions [scene units], vec3 of shape [batch, receiver].
+        normals: Unit normals of the receivers, vec3 of shape [batch, receiver]: spheres below the horizon, which
             cannot change irradiance but whose band-limited logs leak above it, fade out. None keeps them all.
         centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
         radii: Sphere radii [scene units], float32 of shape [batch, sphere]; a radius of 0 blocks nothing.
@@ -260,7 +260,7 @@ def accumulate(
             or more, in radii 2/order of a cell for each coefficient; 0 for never.
         skip, clusters: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
     Returns:
-        Log-visibility, float32 of shape [batch, vertex, order²], index l² + l + m.
+        Log-visibility, float32 of shape [batch, receiver, order²], index l² + l + m.
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii, as the transmittance.
     Differentiable: points, normals, centers, radii.

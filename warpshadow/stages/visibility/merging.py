@@ -1,20 +1,18 @@
 """Merging: four neighboring spheres, seen from so far that they fall into one cell of directions, are one sphere.
 
-Spheres that follow each other in memory make up a cluster, which has a sphere of its own at their middle, as large as
-they look on average over all directions, and an extent E, about half of their diameter. A receiver at distance D sees
-the cluster under a half-angle of about E/D, and takes
+Spheres that follow each other in memory make up a cluster. It has a sphere of its own at their middle, and an extent E,
+about half of their diameter. A receiver at distance D sees it under a half-angle of about E/D, and takes
 
     m = smoothstep((τ² − (E/D)²) / (τ² − τ0²)),  τ0 = 0.7 τ
 
-of the cluster's sphere and 1 − m of the four: the four near by, the one from afar, and blended in between, so that
-nothing jumps as bodies move. The apparent displacement is τ at most. [Ren et al. 2006, section 6.2, has hierarchies
-like this.]
+of the cluster's sphere and 1 − m of the four, so that nothing jumps as bodies move. The apparent displacement is τ at
+most. [Ren et al. 2006, section 6.2, has hierarchies like this.]
 
-How large a cluster looks has two bounds. Its spheres' discs cover no more than their sum S = Σ r². Nor, nearly, do
-they cover more than the shadow of the ellipsoid with their moments M = Σ w_i (d_i d_iᵀ + r_i²/5 I), w_i their parts of
-the volume, which is 5 √(e2(M)/3) on average, e2 being the sum of the products of two eigenvalues; overlapping spheres
-bulge out of it, which a factor of 1.08 makes up for. So r² = (S⁻⁴ + (5.4 √(e2/3))⁻⁴)^(−1/4): for four spheres at random
-the covered area within 10%, on average.
+The cluster's sphere is as large as the four look on average over all directions. That has two bounds: the sum of their
+discs, S = Σ r²; and, nearly, the shadow of the ellipsoid with their moments M = Σ w_i (d_i d_iᵀ + r_i²/5 I), w_i their
+parts of the volume: 5 √(e2(M)/3) on average, e2 the sum of the products of two eigenvalues, times 1.08, since
+overlapping spheres bulge out of it. So r² = (S⁻⁴ + (5.4 √(e2/3))⁻⁴)^(−1/4): for four spheres at random the covered area
+within 10%, on average.
 """
 
 import functools
@@ -127,8 +125,7 @@ def merge(centers: wp.array, radii: wp.array) -> ClusterNodes:
     """Merge every four consecutive spheres; the remainder stays as it is.
 
     Args:
-        centers: Sphere centers [scene units], vec3 of shape [batch, sphere].
-        radii: Sphere radii [scene units], float32 of shape [batch, sphere].
+        centers, radii: Spheres [scene units], vec3 and float32 of shape [batch, sphere].
     Differentiable: centers, radii.
     """
     batch_count, sphere_count = radii.shape

@@ -252,7 +252,6 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
             adjoint → SphereAdjoint.
         Task: Struct of all else that these two read and write.
         is_adjoint: Whether to sum the results of the visits.
-        lanes: Receivers of a block.
     """
     Lane = lane_type(lanes)
     ReceiverLanes, SphereView = receiver_lanes_type(lanes), sphere_view_type(lanes)

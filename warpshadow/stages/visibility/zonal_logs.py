@@ -65,7 +65,6 @@ def zonal_table(order: int, function: str, device: str) -> wp.array:
     digits, and needs no case of its own.
 
     Args:
-        order: Number of bands n.
         function: The log, "eigen" or "cap".
     """
     from scipy.interpolate import CubicSpline
