@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import threading
+import time
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -244,6 +245,14 @@ def test_light_alone_which_takes_no_images_is_drawn_too(viewer, page):
     inverse.fit(light, [inverse.Stage(3)], view=viewer, progress=False)
     page.until(lambda message: "finished after 3 iterations" in str(message))
     assert pictures(page)
+
+
+def test_pages_hear_the_end_of_a_fit_whose_process_ends_right_after(viewer, page):
+    server = viewer.page._server
+    server._websock_server._background_event_loop.call_soon_threadsafe(time.sleep, 0.3)  # a busy machine
+    viewer.page.end("finished after 3 iterations")
+    server.stop()  # as Python does at its exit
+    page.until(lambda message: "finished after 3 iterations" in str(message))
 
 
 def test_view_is_asked_for_by_true_or_a_viewer(monkeypatch, capsys):
