@@ -312,7 +312,7 @@ def test_stop_is_to_the_command_what_an_interrupt_is(tmp_path):
             page.until(lambda _: iterations(page))
             press(page, "Stop")
             page.until(lambda message: "stopped after" in str(message))
-            _, err = run.communicate(timeout=60)
+            _, err = run.communicate(timeout=300)
         finally:
             run.kill()
     assert run.returncode == 130 and "the same command goes on from" in err and "Traceback" not in err
