@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
+# bytecode is kept, whatever the environment says: without it each process of a test compiles torch for 3 s
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test quick lint types docs install-check bench gpu clean
 

@@ -16,6 +16,7 @@ from warpshadow.stages import rasterize
 # measured is a relative L2 of 5e-11 (shading) to 7e-9 (held squarings).
 EXACT = {"eps": 1e-6, "rtol": 1e-7, "atol": 2e-8}
 CUDA_SUMS = 1e-12  # atomics add up in any order
+ORDER = 3  # of harmonics: another has kernels of its own
 
 
 @pytest.fixture(scope="module")
@@ -196,7 +197,7 @@ def test_gradients_of_transmittance_of_receivers_with_footprints_are_exact(doubl
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order, log", [(2, "cap"), (5, "cap"), (3, "eigen"), (8, "eigen")])
+@pytest.mark.parametrize("order, log", [(ORDER, "cap"), (ORDER, "eigen"), (8, "eigen")])
 def test_gradients_of_log_visibility_are_exact(order, log, double, device, check, spheres):
     accumulate = double("stages.visibility.log_sh").accumulate
     check(lambda *scene: accumulate(*scene, order=order, log=log), *spheres)
@@ -204,7 +205,7 @@ def test_gradients_of_log_visibility_are_exact(order, log, double, device, check
 
 def test_gradients_of_log_visibility_without_a_horizon_are_exact(double, device, check, spheres):
     accumulate = double("stages.visibility.log_sh").accumulate
-    check(lambda p, c, r: accumulate(p, None, c, r, order=3), spheres[0], *spheres[2:])
+    check(lambda p, c, r: accumulate(p, None, c, r, order=ORDER), spheres[0], *spheres[2:])
 
 
 @pytest.fixture
@@ -229,7 +230,7 @@ def test_gradients_of_transmittance_of_spheres_that_merge_are_exact(double, devi
 
 def test_gradients_of_log_visibility_of_spheres_that_merge_are_exact(double, device, check, cluster):
     accumulate = double("stages.visibility.log_sh").accumulate
-    check(lambda *scene: accumulate(*scene, order=4, merging=1.0), *cluster)
+    check(lambda *scene: accumulate(*scene, order=ORDER, merging=1.0), *cluster)
 
 
 def test_gradients_of_radiance_of_proxies_are_exact(double, device, check):
@@ -469,17 +470,16 @@ def test_gradients_of_radiosity_and_self_light_are_exact(double, device, check):
     check(light, *sent, (wp.vec3d, random(3, 1, 2, 3)), (wp.vec3d, random(4, 1, 2, 3)))
 
 
-def logs(*sizes, order=3):
+def logs(*sizes):
     """Log-visibility of one instance, of these norms."""
-    rows = random(0, 1, len(sizes), order**2)
+    rows = random(0, 1, len(sizes), ORDER**2)
     return rows * np.array(sizes)[:, None] / np.linalg.norm(rows, axis=-1, keepdims=True)
 
 
-@pytest.mark.parametrize("order, base", [(5, "quadratic"), (2, "linear"), (3, "optimal_linear")])
-def test_gradients_of_the_exponential_are_exact(order, base, double, check):
+@pytest.mark.parametrize("base", ["quadratic", "linear", "optimal_linear"])
+def test_gradients_of_the_exponential_are_exact(base, double, check):
     exponentiate = double("stages.visibility.exponential").exponentiate
-    rows = logs(0.05, 0.3, 1.7, 2.4, 3, order=order)
-    check(lambda f: exponentiate(f, base=base, threshold=0.5), (wp.float64, rows))
+    check(lambda f: exponentiate(f, base=base, threshold=0.5), (wp.float64, logs(0.05, 0.3, 1.7, 2.4, 3)))
 
 
 @pytest.mark.parametrize("base", ["quadratic", "linear", "optimal_linear"])
@@ -492,12 +492,11 @@ def test_gradients_of_the_exponential_where_squarings_are_held_are_exact(base, d
 # ---------------------------------------------------------------------------------------------- shading
 
 
-@pytest.mark.parametrize("order", [3, 5])
-def test_gradients_of_harmonic_transfer_are_exact(order, double, device, check):
-    visibility, normals = (wp.float64, random(0, 1, 3, order**2)), (wp.vec3d, unit(random(1, 1, 3, 3)))
+def test_gradients_of_harmonic_transfer_are_exact(double, device, check):
+    visibility, normals = (wp.float64, random(0, 1, 3, ORDER**2)), (wp.vec3d, unit(random(1, 1, 3, 3)))
     sh_transfer = double("stages.light.transfer").sh_transfer
-    check(lambda v, n: sh_transfer(v, n, order=order), visibility, normals)
-    check(lambda n: sh_transfer(None, n, order=order), normals)
+    check(lambda v, n: sh_transfer(v, n, order=ORDER), visibility, normals)
+    check(lambda n: sh_transfer(None, n, order=ORDER), normals)
 
 
 def test_gradients_of_directional_transfer_are_exact(double, device, check):
@@ -671,7 +670,7 @@ def make_renderer(double, device):
             double("scene.scene").Body(ground, blockers=0, receivers=receivers),
             double("scene.scene").Body(body, blockers=spheres, translation=PLACES[1], scale=SCALES[1]),
         ]
-        settings = {"method": method, "directions": 16, "order": 3, "self_shadows": "spheres"}  # rays are float32
+        settings = {"method": method, "directions": 16, "order": ORDER, "self_shadows": "spheres"}  # rays are float32
         visibility = double("scene.scene").Visibility.of(settings)
         whole = double("scene.scene").Scene(
             bodies=bodies, light=LIGHT, camera=camera, visibility=visibility, supersampling=1

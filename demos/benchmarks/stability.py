@@ -155,7 +155,7 @@ def directional_stage(count: int) -> Stage:
 
 VISIBILITY = {
     "directional 128": directional_stage(128),
-    **{f"log-SH {log} {order}": log_sh_stage(order, log) for log in ("eigen", "cap") for order in (2, 5, 8)},
+    **{f"log-SH {log} {order}": log_sh_stage(order, log) for log in ("eigen", "cap") for order in (2, 4, 8)},
 }
 
 

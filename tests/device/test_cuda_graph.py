@@ -147,7 +147,7 @@ def test_a_captured_pose_fit_has_the_loss_and_gradient_of_a_plain_one(
 ):
     """As on a GPU, all vertices are receivers."""
     monkeypatch.setattr(receiver_finder, "is_readable", lambda device: False)  # as on a GPU
-    visibility = ws.Visibility.of({"method": method, "directions": 32, "order": 3})
+    visibility = ws.Visibility.of({"method": method, "directions": 32, "order": 4})
     bodies = [dataclasses.replace(body, receivers=receivers) for body in scene.bodies]
     scene = ws.Scene(bodies, scene.light, scene.camera, visibility, bounces=bounces)
     pose = warp_loop.FreePose(ws.Renderer(scene, device=device))
@@ -231,7 +231,7 @@ class MovingBall(warp_loop.FreePose):
 def beside_static_bodies(scene, method="directional"):
     """The ball over a ground that receives at vertices, where results about static bodies are cached."""
     ground = dataclasses.replace(scene.bodies[1], receivers="vertex")
-    visibility = ws.Visibility.of({"method": method, "directions": 32, "order": 3})
+    visibility = ws.Visibility.of({"method": method, "directions": 32, "order": 4})
     return ws.Scene((scene.bodies[0], ground), scene.light, scene.camera, visibility)
 
 
@@ -252,7 +252,7 @@ def test_nothing_is_copied_from_the_host_while_a_pose_fit_is_captured(
     textured = {"roughness": np.full((4, 4), 0.5)} if is_glossy else {}
     ground = ws.Body(ws.plane(4, 8), texture=np.full((4, 4, 3), 0.5), **textured)
     ball = dataclasses.replace(scene.bodies[0], **gloss)
-    visibility = ws.Visibility.of({"method": method, "directions": 32, "order": 3})
+    visibility = ws.Visibility.of({"method": method, "directions": 32, "order": 4})
     scene = ws.Scene((ball, ground), scene.light, scene.camera, visibility, bounces=bounces)
     target = wp.zeros(24 * 24, dtype=wp.vec4, device="cpu")
     assert_only_plain_calls_copy(MovingBall(scene, "cpu", **options).loss_with_gradients(target), accesses)

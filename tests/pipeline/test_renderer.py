@@ -743,7 +743,7 @@ def test_a_plain_tuple_is_a_geometry_whose_rotations_are_not_known(device):
 @pytest.mark.parametrize("method", ["directional", "log-sh"])
 def test_a_gpu_names_the_argument_at_fault_after_the_call(method, name, value, monkeypatch):
     """There arrays are looked at when a call ends, until when kernels work on what is at fault."""
-    renderer = SceneRenderer(scene_of(method, ball(), ground(8), camera=FROM_ABOVE, directions=32, order=3))
+    renderer = SceneRenderer(scene_of(method, ball(), ground(8), camera=FROM_ABOVE, directions=32, order=4))
     poses = renderer.scene_poses()
 
     def draw(spoiled: str):

@@ -7,7 +7,7 @@ import viser
 import zstandard
 from websockets.sync.client import connect
 
-PATIENCE = 20.0  # seconds
+PATIENCE = 60.0  # seconds: a busy machine is slow
 
 
 def is_image(message):

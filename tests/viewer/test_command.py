@@ -45,13 +45,13 @@ def seconds_to_end(scene) -> float:
         try:
             line = run.stdout.readline()
             url = re.match(r"(http://127\.0\.0\.1:\d+) ", line).group(1)
-            connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=60)
+            connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=300)
             connection.request("GET", "/")
             answer = connection.getresponse()
             assert answer.status == 200 and b"<html" in answer.read()
             run.send_signal(signal.SIGINT)
             start = time.monotonic()
-            out, err = run.communicate(timeout=60)
+            out, err = run.communicate(timeout=300)
             seconds = time.monotonic() - start
         finally:
             run.kill()

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import threading
+import time
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -246,6 +247,14 @@ def test_light_alone_which_takes_no_images_is_drawn_too(viewer, page):
     assert pictures(page)
 
 
+def test_pages_hear_the_end_of_a_fit_whose_process_ends_right_after(viewer, page):
+    server = viewer.page._server
+    server._websock_server._background_event_loop.call_soon_threadsafe(time.sleep, 0.3)  # a busy machine
+    viewer.page.end("finished after 3 iterations")
+    server.stop()  # as Python does at its exit
+    page.until(lambda message: "finished after 3 iterations" in str(message))
+
+
 def test_view_is_asked_for_by_true_or_a_viewer(monkeypatch, capsys):
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
@@ -303,7 +312,7 @@ def test_stop_is_to_the_command_what_an_interrupt_is(tmp_path):
             page.until(lambda _: iterations(page))
             press(page, "Stop")
             page.until(lambda message: "stopped after" in str(message))
-            _, err = run.communicate(timeout=60)
+            _, err = run.communicate(timeout=300)
         finally:
             run.kill()
     assert run.returncode == 130 and "the same command goes on from" in err and "Traceback" not in err

@@ -14,7 +14,7 @@ from warpshadow.viewer.painter import Frame
 from warpshadow.viewer.state import ViewerState
 
 REST = 0.05
-PATIENCE = 10.0  # seconds: a busy machine is slow, and what comes, comes at once
+PATIENCE = 60.0  # seconds: a busy machine is slow, and what comes, comes at once
 
 
 def viewer_state():

@@ -107,7 +107,7 @@ class FitPage:
         """Show how the fit ended, to be seen as long as browsers stay open."""
         self._note.content = _note_html(html.escape(note))
         self._pause.disabled = self._stop.disabled = True
-        self._server.flush()
+        self._server.deliver()  # the process may end right after
 
     def close(self) -> None:
         """Stop serving; browsers keep the last state."""

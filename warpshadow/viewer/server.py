@@ -22,7 +22,7 @@ from viser import _messages as messages
 
 from warpshadow import check
 
-_LAST_SECONDS = 0.1  # of viser's thread, which sends messages every 1/60 s
+_DELIVERY_SECONDS = 5.0  # that messages may take; a page that hangs takes none
 OWN_NAMES = ("localhost", "127.0.0.1", "::1")  # names that only this machine has for itself
 
 
@@ -47,12 +47,31 @@ class Server(viser.ViserServer):
         self.on_client_connect(self._refuse_uploads_of)
         self.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
 
+    def deliver(self) -> None:
+        """Send all messages to all pages, and return when they are sent; viser's ``flush`` returns at once."""
+        loop = self._websock_server._background_event_loop
+        if loop is None or loop.is_closed():
+            return
+        self.flush()
+        delivery = asyncio.run_coroutine_threadsafe(self._sent(), loop)
+        with contextlib.suppress(concurrent.futures.TimeoutError):
+            delivery.result(_DELIVERY_SECONDS)
+        delivery.cancel()
+
+    async def _sent(self) -> None:
+        """Return when no message waits for a page."""
+        server = self._websock_server
+        buffers = [server._broadcast_buffer, *(state.message_buffer for state in server._client_state_from_id.values())]
+        while any(
+            last_sent < buffer.message_counter - 1
+            for buffer in buffers
+            for last_sent in buffer.generator_cursors.values()
+        ):
+            await asyncio.sleep(1e-3)
+
     def close(self) -> None:
         """Let all pages go, when they have heard the last messages, and serve no more."""
-        loop = self._websock_server._background_event_loop
-        if loop is not None:
-            with contextlib.suppress(concurrent.futures.TimeoutError, RuntimeError):  # busy, or closed already
-                asyncio.run_coroutine_threadsafe(asyncio.sleep(_LAST_SECONDS), loop).result(1.0)
+        self.deliver()
         stop_thread = threading.Thread(target=self.stop, daemon=True)
         stop_thread.start()
         stop_thread.join(1.0)  # it waits six seconds for connections that browsers keep

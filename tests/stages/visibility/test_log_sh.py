@@ -113,7 +113,7 @@ def test_one_sphere_straight_up_gives_the_golden_zonal_log(log, golden_data, dev
 
 
 @pytest.mark.parametrize("log", LOGS)
-@pytest.mark.parametrize("order", [2, 5, 8])
+@pytest.mark.parametrize("order", [2, 4, 8])
 def test_tiny_caps_keep_their_relative_accuracy(log, order, device):
     """The difference P_{l−1} − P_{l+1} would lose everything at sin θ = 1e-4."""
     sine = np.geomspace(1e-4, 1e-1, 20)
@@ -286,9 +286,8 @@ def test_visibility_stays_bounded_however_spheres_overlap(centers, log, device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order", [2, 8])
-@pytest.mark.parametrize("base", BASES)
-def test_exponentials_are_those_of_the_float64_twin(base, order, device):
+@pytest.mark.parametrize("order, base", [(2, "quadratic"), *((8, base) for base in BASES)])
+def test_exponentials_are_those_of_the_float64_twin(order, base, device):
     points, normals, centers, radii = twins.random_scene(order, vertex_count=50)
     rows = accumulate(points, normals, centers, radii, device, order=order).astype(float)
     rows[0] = 0
@@ -339,7 +338,7 @@ def test_nothing_jumps_where_the_number_of_squarings_changes(base, device):
 
 @pytest.mark.parametrize("base", BASES)
 def test_a_threshold_beyond_stability_is_refused(base):
-    rows = np.zeros((1, 16))
+    rows = np.zeros((1, 64))
     limit = exponential.THRESHOLDS[base].limit
     assert np.isfinite(exponentiate(rows, base=base, threshold=limit)).all()
     for threshold in (1.01 * limit, 4.0 * limit, 0.0, -1.0, float("nan"), float("inf")):
