@@ -20,11 +20,13 @@ from warpshadow.assets.mesh import Mesh
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene.body import Body
+from warpshadow.scene.spots import has_narrow_spot
 from warpshadow.scene.visibility import (
     BOUNCE_METHODS,
     DEFAULT_METHOD,
     DIRECTIONS,
     DIRECTIONS_OF_GLOSS,
+    DIRECTIONS_OF_SPOTS,
     FULL_LIGHT_METHODS,
     METHODS,
     NARROW_ROUGHNESS,
@@ -278,12 +280,14 @@ class Scene:
 
     @property
     def direction_count(self) -> int:
-        """Cells of "directional": as many as are asked for, or 256 where a body's smallest roughness is below 0.3.
+        """Cells of "directional": as many as are asked for, or as many as :data:`DIRECTIONS` and those below it say.
 
-        Roughness that calls of a renderer pass does not count, nor that a fit finds.
+        Roughness and emission that calls of a renderer pass do not count, nor those that a fit finds.
         """
         if self.visibility.directions is not None:
             return self.visibility.directions
+        if self.bounces and has_narrow_spot(self):
+            return DIRECTIONS_OF_SPOTS
         roughness = [body.roughness.min() for body in self.bodies if body.roughness is not None]
         return DIRECTIONS_OF_GLOSS if min(roughness, default=1.0) < NARROW_ROUGHNESS else DIRECTIONS
 
