@@ -53,12 +53,12 @@ class Server(viser.ViserServer):
         if loop is None or loop.is_closed():
             return
         self.flush()
-        delivery = asyncio.run_coroutine_threadsafe(self._sent(), loop)
+        delivery = asyncio.run_coroutine_threadsafe(self._wait_until_sent(), loop)
         with contextlib.suppress(concurrent.futures.TimeoutError):
             delivery.result(_DELIVERY_SECONDS)
         delivery.cancel()
 
-    async def _sent(self) -> None:
+    async def _wait_until_sent(self) -> None:
         """Return when no message waits for a page."""
         server = self._websock_server
         buffers = [server._broadcast_buffer, *(state.message_buffer for state in server._client_state_from_id.values())]
