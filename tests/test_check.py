@@ -172,7 +172,7 @@ def test_a_wrong_shape_is_named_with_the_expected_one(got):
     ("call", "message"),
     [
         (lambda: ws.Camera(eye=(0, 0, 1)), r"Camera: unknown argument 'eye' \(write Camera.look_at\(eye, target"),
-        (lambda: ws.Body(ws.icosphere(), color=(1, 0, 0)), r"Body: unknown argument 'color' \(write albedo\)"),
+        (lambda: ws.Body(ws.icosphere(), color=1), r"Body: unknown argument 'color' \(did you mean 'albedo'\?\)"),
         (lambda: ws.Body(ws.icosphere(), scal=2), r"Body: unknown argument 'scal' \(did you mean 'scale'\?\)"),
         (lambda: ws.render(None, bounces=2), r"render: unknown argument 'bounces' \(write Scene\(…, bounces=…\)\)"),
     ],

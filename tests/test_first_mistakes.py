@@ -195,6 +195,7 @@ def test_functions_that_are_looked_for_in_the_wrong_place_are_named():
     for name, remedy in (
         ("look_at", r"Camera.look_at\(eye, target"),
         ("Light", "EnvironmentMap"),
+        ("load_envmap", r"EnvironmentMap.read\(path"),
         ("cube", r"Body\(trimesh.creation.box\("),
         ("cylinder", r"Body\(trimesh.creation.cylinder\("),
     ):

@@ -69,6 +69,7 @@ _ELSEWHERE = {
     "box": _SOLID.format("box"),
     "cylinder": _SOLID.format("cylinder"),
     "sphere": "icosphere",
+    **dict.fromkeys(("load_envmap", "read_envmap", "load_environment_map"), "EnvironmentMap.read(path)"),
 }
 """Remedies for names that are looked for here."""
 

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import ParamSpec, TypeGuard, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeGuard, TypeVar
 
 import numpy as np
 import warp as wp
@@ -30,6 +30,22 @@ _OWN_FOLDER = str(Path(__file__).parent) + os.sep
 _PASSED_OVER = ("contextlib", "dataclasses", "functools", "torch")  # modules between a user's line and ours
 
 _MAX_QUOTED_LENGTH = 60  # characters of a value that messages quote
+
+
+_SYNONYMS = {
+    **dict.fromkeys(("color", "colour", "base_color", "diffuse", "reflectance"), ("albedo",)),
+    **dict.fromkeys(("position", "pos", "location", "offset", "foot"), ("eye", "translation")),
+    **dict.fromkeys(("at", "look_at", "lookat"), ("target",)),
+    **dict.fromkeys(("width", "height", "resolution"), ("size", "on_ground")),
+    **dict.fromkeys(("file", "path", "filename"), ("mesh", "envmap", "image")),
+    **dict.fromkeys(("map", "hdri", "hdr", "env", "environment"), ("envmap",)),
+    **dict.fromkeys(("intensity", "strength", "brightness"), ("scale",)),
+    **dict.fromkeys(("steps", "epochs"), ("iterations",)),
+    **dict.fromkeys(("load", "open", "from_file"), ("read",)),
+    "lr": ("learning_rate",),
+    "size": ("on_ground",),
+}
+"""Names that other libraries have for arguments, keys and functions, and ours: the first that there is, is meant."""
 
 
 class _Nothing:
@@ -150,6 +166,16 @@ def frozen(**instead: str) -> Callable[[type[T]], type[T]]:
         return kind
 
     return decorate
+
+
+class Hinting(type):
+    """Class of classes whose AttributeError names the nearest of their own names, as of a function to read files."""
+
+    if not TYPE_CHECKING:  # it would have any name
+
+        def __getattr__(cls, name: str) -> Any:
+            own_names = [own for own in dir(cls) if not own.startswith("_")]
+            raise AttributeError(f"{cls.__name__} has no {name!r}{suggestion(name, own_names)}")
 
 
 @contextlib.contextmanager
@@ -359,6 +385,17 @@ def pixels(name: str, values: object, *, expected: str, error: type[ValueError] 
     return copied
 
 
+def photograph(name: str, values: object) -> np.ndarray:
+    """Copy linear values of a photograph as :func:`pixels` does; codes of a picture are refused as floats, too."""
+    copied = pixels(name, values, expected="linear RGB [height, width, 3], or the path of a picture")
+    if copied.size and np.ptp(copied) > 0 and 16 < copied.max() <= 255 and (copied == np.rint(copied)).all():
+        raise ValueError(
+            f"{name}: got whole numbers up to {copied.max():g}, expected linear values: those of an 8-bit picture are "
+            "warpshadow.srgb_to_linear(values / 255), and read_image(path) reads one"
+        )
+    return copied
+
+
 def reflectance(name: str, values: np.ndarray) -> None:
     """Raise ValueError unless all values are finite and in [0, 1]."""
     finite(name, values)
@@ -441,5 +478,6 @@ def missing(feature: str, package: str, extra: str) -> str:
 
 def suggestion(value: object, choices: list) -> str:
     """Name the nearest choice, for messages; empty where none is near."""
-    near = difflib.get_close_matches(str(value), map(str, choices), n=1, cutoff=0.5)
+    near = [name for name in _SYNONYMS.get(str(value), ()) if name in choices]
+    near = near or difflib.get_close_matches(str(value), map(str, choices), n=1, cutoff=0.5)
     return f" (did you mean {near[0]!r}?)" if near else ""

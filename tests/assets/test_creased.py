@@ -11,6 +11,7 @@ import trimesh
 import warpshadow as ws
 from warpshadow.assets.topology import face_normals, welded
 from warpshadow.scene.body import Body
+from warpshadow.scene.remarks import rounded_edges
 from warpshadow.torch import TorchRenderer
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
@@ -273,6 +274,21 @@ def test_the_lip_of_a_vase_is_sharp_however_coarse_its_sides_are(sides, tmp_path
     assert mesh.surface.is_closed and mesh.rounds_edges and not mesh.creased().rounds_edges
     trimesh.Trimesh(mesh.positions, mesh.faces, process=False).export(tmp_path / "vase.stl")
     assert not ws.load_mesh(tmp_path / "vase.stl").rounds_edges  # an STL file has no vertices to share at its lip
+
+
+@pytest.mark.parametrize(("mesh", "is_said"), [(vase(24), False), (tube(24), True), (CUBE, True)])
+def test_edges_are_remarked_on_where_much_of_the_surface_shows_them(mesh, is_said):
+    assert mesh.rounds_edges and mesh.creased().edge_rounding == 0
+    scene = ws.Scene([ws.Body(mesh)], ws.EnvironmentMap.constant(1.0))
+    assert bool(rounded_edges(scene)) == is_said
+
+
+def test_the_rounding_of_edges_is_the_mean_difference_of_normals():
+    of_faces = face_normals(CUBE.positions[CUBE.faces])  # whose areas are the same
+    normals = np.array([of_faces[(CUBE.faces == vertex).any(axis=1)].sum(axis=0) for vertex in range(8)])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    gaps = np.linalg.norm(normals[CUBE.faces] - of_faces[:, None], axis=2)
+    assert CUBE.edge_rounding == pytest.approx(np.mean(gaps), rel=1e-5)
 
 
 def test_short_rings_of_sharp_edges_are_no_lips():

@@ -145,6 +145,17 @@ def test_neighbors_cannot_repair_a_channel_without_a_good_value(tmp_path):
         EnvironmentMap.read(tmp_path / "a.exr", sanitize="neighbors")
 
 
+@pytest.mark.parametrize("name", ["load", "open", "from_file", "reed"])
+def test_other_names_of_the_function_that_reads_a_file_get_its_name(name):
+    with pytest.raises(AttributeError, match=rf"^EnvironmentMap has no '{name}' \(did you mean 'read'\?\)$"):
+        getattr(EnvironmentMap, name)
+
+
+def test_a_photograph_is_no_cube_map_alone():
+    with pytest.raises(ImageError, match="a cube map or a photograph, expected an equirectangular map, 360° wide"):
+        EnvironmentMap(np.ones((12, 16, 3)))
+
+
 def test_a_cube_map_file_is_named_as_such(tmp_path):
     import OpenEXR
 

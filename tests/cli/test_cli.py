@@ -621,7 +621,7 @@ def test_fit_recovers_a_color_from_a_rendered_exr_and_says_what_it_wrote(fit_fil
     assert result.exit_code == 0, result.output
     assert re.search(r"^(finished|converged) after \d+ iterations, [\d.]+ ms each$", result.stdout, re.M)
     assert re.search(r"^loss \d\S* before, \d\S* after$", result.stdout, re.M)
-    (color,) = re.findall(r": albedo \((.*), (.*), (.*)\)$", result.stdout, re.M)
+    (color,) = re.findall(r" albedo +\((.*), (.*), (.*)\)$", result.stdout, re.M)
     np.testing.assert_allclose([float(value) for value in color], COLOR, atol=RECOVERED)
     assert not result.stderr  # which is no terminal, so no bars
     (files,) = re.findall(rf"^{folder}: (.*)$", result.stdout, re.M)

@@ -197,6 +197,18 @@ def test_a_bar_whose_block_fails_makes_way(terminal, no_delay):
     assert "sorting" in terminal.readouterr().err
 
 
+def test_the_time_that_is_left_is_that_of_the_work_under_way(monkeypatch):
+    """After 60 s of preparing, ten of twenty steps took 10 s."""
+    now = 0.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    wait = progress.Wait("preparing", 20, "step")
+    now = 60.0
+    wait.describe("fitting")
+    now = 70.0
+    wait.update(10)
+    assert wait.line() == "fitting: 10 of 20 steps, 70 s, 10 s left"
+
+
 def test_a_bar_ends_where_less_was_to_do(terminal, no_delay):
     with progress_bar(100, "fitting", "it", stays=True) as bar:
         bar.update(30)

@@ -9,8 +9,21 @@ import pytest
 import torch
 
 import warpshadow as ws
-from warpshadow.inverse import Albedo, DiagnosticWarning, Exposure, Light, Pose, Problem, Stage, Target, Texture, fit
-from warpshadow.inverse.diagnostics import gain_of_last
+from warpshadow.inverse import (
+    Albedo,
+    DiagnosticWarning,
+    Emission,
+    Exposure,
+    Light,
+    Pose,
+    Problem,
+    Stage,
+    Sun,
+    Target,
+    Texture,
+    fit,
+)
+from warpshadow.inverse.diagnostics import gain_of_last, warn_before
 
 
 def scene(size: float = 4.0) -> ws.Scene:
@@ -51,13 +64,58 @@ def test_a_texture_that_may_keep_a_shadow_is_told():
         assert not any("is free beside" in text for text in messages(Problem(both, target, free), Stage(1, 0.05)))
 
 
-def test_light_exposure_and_all_albedos_are_not_told_apart():
-    target, free = Target(ws.render(scene())[..., :3]), [Light(2), Exposure(), Albedo(0)]
-    told = [text for text in messages(Problem(scene(), target, free), Stage(1, 0.05)) if text.startswith("free:")]
-    assert len(told) == 1 and "got light, exposure and the reflectance of all bodies" in told[0]
-    for left_out in range(3):
-        known = Problem(scene(), target, free[:left_out] + free[left_out + 1 :])
-        assert not any(text.startswith("free:") for text in messages(known, Stage(1, 0.05)))
+LAMP = ws.Body(ws.icosphere(0.2, 1), emission=(5, 5, 5), translation=(0, 1, 0), blockers=0)
+BALL = ws.Body(ws.icosphere(0.4, 1), translation=(0, 0.4, 0), blockers=8)
+BLACK = ws.EnvironmentMap.constant(0.0)
+SUN = Sun((0, 1, 0.2), 3.0)
+
+
+@pytest.mark.parametrize(
+    ("free", "factors", "bodies", "changes"),
+    [
+        ([Light(2)], "", [], {}),
+        ([Light(2), Exposure()], "light and exposure", [], {}),
+        ([Light(2), Exposure(reference=0)], "", [], {}),
+        ([Light(2), Albedo(0)], "light and the reflectance of all bodies", [], {}),
+        ([Light(2), Texture(0, (4, 4))], "light and the reflectance of all bodies", [], {}),
+        ([Exposure(), Albedo(0)], "exposure and the reflectance of all bodies", [], {}),
+        ([Light(2), Exposure(), Albedo(0)], "light and exposure and the reflectance of all bodies", [], {}),
+        ([Light(2), Albedo(0)], "", [BALL], {}),  # whose albedo is known
+        ([Light(2), Albedo(0)], "light and .*", [dataclasses.replace(BALL, translation=(50, 0, 0))], {}),  # not seen
+        ([Light(2), Albedo(0), Albedo(1)], "light and the reflectance of all bodies", [BALL], {}),
+        ([Light(2), Albedo(0), Albedo(1)], "", [dataclasses.replace(BALL, roughness=0.3)], {}),  # reflects 4% more
+        ([Light(2), Albedo(0), Albedo(1)], "", [BALL], {"bounces": 1, "visibility": ws.Visibility()}),
+        ([Light(2), Exposure()], "", [LAMP], {}),  # whose radiance is known
+        ([Light(2), Emission(1), Exposure()], "light and exposure", [LAMP], {}),
+        ([Emission(1), Exposure()], "light and exposure", [LAMP], {"light": BLACK}),
+        ([Emission(1), Albedo(0), Albedo(1)], "", [LAMP], {"light": BLACK}),  # the lamp itself is seen
+        ([SUN, Exposure()], "", [], {"light": ws.EnvironmentMap.constant(1.0)}),
+        ([SUN, Exposure()], "light and exposure", [], {"light": BLACK}),
+    ],
+)
+def test_free_factors_of_all_images_are_told_and_no_others(free, factors, bodies, changes):
+    where = dataclasses.replace(scene(), bodies=[*scene().bodies, *bodies], **changes)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warn_before(Problem(where, Target(np.ones((16, 16, 3))), free))
+    told = [str(item.message) for item in caught]
+    assert len(told) == bool(factors)
+    for text in told:
+        assert re.match(f"free: got {factors}, expected all but one of them to be known: .*; leave out", text)
+
+
+def test_a_fit_says_before_it_begins_that_its_scale_is_not_told_and_a_reference_tells_it():
+    image = ws.render(scene())[..., :3]
+    targets = [Target(image), Target(2 * image)]
+    stage = Stage(60, 0.05)
+    told = messages(Problem(scene(), targets, [Light(2), Exposure()]), stage)
+    assert any(text.startswith("free: got light and exposure") for text in told)
+    known = Problem(scene(), targets, [Light(2), Exposure(reference=0)])
+    assert not any(text.startswith("free:") for text in messages(known, stage))
+    result = fit(known, [stage], progress=False)
+    assert result.found.exposures[0] == 1 and result.found.exposures[1] == pytest.approx(2, rel=0.02)
+    with pytest.raises(ValueError, match="reference: got 2, expected the number of a view, from 0 to 1"):
+        Problem(scene(), targets, Exposure(reference=2))
 
 
 def test_light_that_has_not_converged_is_told():

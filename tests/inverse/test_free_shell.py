@@ -78,7 +78,7 @@ def test_the_radius_that_a_fit_finds_is_in_its_summary_and_said_after_few_steps(
     radius = result.scene.light.radius
     summary = toml_tables.read(tmp_path / "summary.toml", "summary")
     assert summary["figures"] == {"light.radius": pytest.approx(radius)} and radius == pytest.approx(2.0, rel=RADIUS)
-    assert f"light: radius {radius:.4g}" in found_values(result)
+    assert f"light radius  {radius:.4g} scene units" in found_values(result)
 
 
 def test_light_that_a_fit_finds_keeps_its_radius():

@@ -29,6 +29,7 @@ from warpshadow.inverse import (
 from warpshadow.inverse.target import stack_targets
 
 CPU = torch.device("cpu")
+CODES = np.arange(60, dtype=np.float32).reshape(4, 5, 3)
 
 
 def small_scene(*, size: tuple[int, int] = (24, 24), **visibility) -> ws.Scene:
@@ -62,6 +63,8 @@ def noise(*shape: int, seed: int = 0) -> np.ndarray:
         ({"image": np.zeros((4, 5, 3), bool)}, "image: got ndarray of bool"),
         ({"image": np.zeros((3, 4, 5))}, r"image: got shape \(3, 4, 5\), .*: channels come last"),
         ({"image": None}, "image: got None, expected linear RGB"),
+        ({"image": CODES}, r"image: got whole numbers up to 59, .*srgb_to_linear\(values / 255\)"),
+        ({"image": torch.tensor(CODES)}, r"image: got whole numbers up to 59, .*srgb_to_linear\(values / 255\)"),
         ({"mask": np.full((4, 5), 255, np.uint8)}, "mask: got values from 255 to 255, .*mask / 255"),
         ({"mask": "x"}, "mask: no such file: x"),
         ({"camera": "front"}, "camera: got 'front', expected a Camera"),
@@ -156,11 +159,19 @@ def test_the_unit_is_the_root_mean_square_of_what_counts():
 def test_arrays_are_targets_as_they_are():
     scene = small_scene()
     image = np.full((24, 24, 3), 0.5, np.float32)
-    for targets in (image, [image], [Target(image)]):
+    for targets in (image, [image], [Target(image)], torch.tensor(image)):
         (target,) = Problem(scene, targets, Exposure()).targets
         np.testing.assert_array_equal(target.image, image)
     with pytest.raises(ValueError, match=r"^targets\[0\]: image: got shape"):
         Problem(scene, [image[..., 0]], Exposure())
+
+
+def test_cameras_that_see_no_body_are_refused_where_nothing_moves():
+    scene, image = small_scene(), np.full((24, 24, 3), 0.5, np.float32)
+    away = Target(image, camera=ws.Camera.look_at((0, 1, 5), (0, 1, 10), size=(24, 24)))
+    with pytest.raises(ValueError, match="^targets: got cameras that see no body, expected one that does"):
+        Problem(scene, [away, away], Light(2))
+    assert Problem(scene, [away, Target(image)], Light(2)) and Problem(scene, away, CameraPose())
 
 
 # ---------------------------------------------------------------------------------------------- losses

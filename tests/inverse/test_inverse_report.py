@@ -124,12 +124,19 @@ def test_a_translation_is_printed_with_the_shift_of_the_middle_from_the_start():
     ball = replace(scene.bodies[0], mesh=far, blockers=0, translation=(-50, 0.6, 0))
     result = run(Pose(0), scene=replace(scene, bodies=[ball, scene.bodies[1]]))
     (line,) = [line for line in found_values(result) if "translation" in line]
-    found, shift = re.fullmatch(r"\S+: translation \((.*)\): its middle moved by \((.*)\)", line).groups()
+    pattern = r"\S+ translation  \((.*)\) scene units, its middle moved by \((.*)\)"
+    found, shift = re.fullmatch(pattern, line).groups()
     body = result.scene.bodies[0]
     np.testing.assert_allclose([float(part) for part in found.split(", ")], body.translation, rtol=1e-3)
     moved = [float(part) for part in shift.split(", ")]
     np.testing.assert_allclose(moved, body.to_world(np.array([50.0, 0, 0])) - (0, 0.6, 0), atol=1e-4)
     assert 0 < np.linalg.norm(moved) < 1
+
+
+def test_found_values_stand_below_each_other_with_their_units():
+    *others, exposure = found_values(run(Albedo(0), Exposure()))
+    assert re.fullmatch(r"exposure  +-?[\d.]+ stops", exposure) and others
+    assert {re.match(r".*?  +", line).end() for line in others} == {re.match(r"exposure +", exposure).end()}
 
 
 def test_all_values_are_in_an_archive_by_their_names(tmp_path):

@@ -1,4 +1,4 @@
-"""Remarks on likely mistakes: metals without bounces, a sun below the ground, rotations in radians."""
+"""Remarks on likely mistakes: metals without bounces, a sun below the ground, rotations in radians, other frames."""
 
 import warnings
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
-from warpshadow.scene.remarks import black_metals, sun_below
+from warpshadow.scene.remarks import black_metals, is_out_of_frame, sun_below, unframed
 
 GROUND = ws.Body(ws.plane(4.0, 1), name="ground")
 SKY = ws.EnvironmentMap.constant(0.2, height=64)
@@ -58,6 +58,44 @@ def test_a_rotation_by_eighths_of_a_turn_in_radians_draws_a_warning(rotation):
     degrees = ", ".join(f"{round(number / 0.785) * 45}" for number in rotation)
     with pytest.warns(UserWarning, match=rf"rotation: got .*expected degrees; .*\({degrees}\) is meant"):
         ws.Body(ws.icosphere(0.5, 1), rotation=rotation)
+
+
+def test_a_body_that_is_stood_on_the_ground_warns_of_radians_once():
+    with pytest.warns(UserWarning, match="expected degrees") as said:
+        ws.Body(ws.icosphere(0.5, 1), rotation=(0, 1.57, 0)).on_ground(size=2)
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize(
+    ("eye", "target", "is_unframed"),
+    [
+        ((0, 1, 4), (0, 0.5, 0), False),
+        ((0, 1, 4), (0, 1, 8), True),  # the ball is behind it
+        ((0, 3, 0), (1.3, 0, 0), False),  # the ball's shadow may be meant
+        ((0, 1, 4), (9, 1, 4), True),
+    ],
+)
+def test_a_camera_that_sees_the_ground_alone_is_remarked_on(eye, target, is_unframed):
+    camera = ws.Camera.look_at(eye, target, fov_y=20, size=(16, 16))
+    remarks = unframed(ws.Scene([gold(), GROUND], SKY), [camera])
+    assert bool(remarks) == is_unframed
+    assert not is_unframed or "got one that sees the ground alone, expected 'gold' in its frame" in remarks[0]
+    assert not unframed(ws.Scene([GROUND, ws.point_light((0, 9, 0), 5.0)], SKY), [camera])
+
+
+def test_a_renderer_says_that_its_camera_sees_an_endless_ground_alone():
+    camera = ws.Camera.look_at((0, 1, 4), (0, 0.5, 8), size=(16, 16))
+    scene = ws.Scene([gold(), ws.Body(ws.infinite_ground(6.0), name="ground")], SKY, camera, bounces="all")
+    with pytest.warns(UserWarning, match="camera: got one that sees the ground alone") as said:
+        ws.render(scene)
+    assert len(said) == 1
+
+
+def test_points_on_several_sides_of_a_frame_may_be_a_body_in_it():
+    camera = ws.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=10, size=(16, 16))
+    assert not is_out_of_frame(ws.Body(ws.plane(9.0, 1), rotation=(90, 0, 0)), camera)  # all its corners are outside
+    assert is_out_of_frame(ws.Body(ws.icosphere(0.3, 1), translation=(0, 0.7, 0)), camera)
+    assert not is_out_of_frame(ws.Body(ws.icosphere(0.3, 1), translation=(0, 0.7, 0)), camera, 3.0)
 
 
 @pytest.mark.parametrize(

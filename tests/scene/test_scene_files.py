@@ -350,7 +350,8 @@ def test_a_body_in_a_file_may_be_creased(load, refused, tmp_path):
     [
         ("on_ground = 1", "on_ground: got 1, expected true or false, or a table such as {size = 2.0}"),
         ("on_ground = {size = 0}", "on_ground: size: got 0, expected a positive number"),
-        ("on_ground = {foot = [0, 0, 0]}", "on_ground: unknown key 'foot'; known keys are size"),
+        ("on_ground = {foot = [1, 0, 0]}", "on_ground: foot: got [1, 0, 0], expected it as translation"),
+        ("on_ground = {sizes = 2}", "on_ground: unknown key 'sizes' (did you mean 'size'?); known keys are size"),
         ("scale = 2\non_ground = {size = 1}", "on_ground: size: got it beside the body's scale"),
     ],
 )
@@ -413,6 +414,10 @@ def test_a_missing_file_of_spheres_or_colors_is_named(refused, line):
         ),
         (TABLES + "name = cow\n", 'text is in quotes, "…"'),
         (TABLES + "color = [1, 0, 0]\n", "unknown key 'color' (did you mean 'albedo'?)"),
+        (TABLES + "foot = [1, 0, 0]\n", "unknown key 'foot' (did you mean 'translation'?)"),
+        (TABLES + "height = 2\n", "unknown key 'height' (did you mean 'on_ground'?)"),
+        (TABLES.replace("eye =", "position ="), "unknown key 'position' (did you mean 'eye'?)"),
+        (TABLES.replace("target =", "look_at ="), "unknown key 'look_at' (did you mean 'target'?)"),
         (
             TABLES.replace("eye = [0, 1, 4]\ntarget = [0, 0, 0]\n", ""),
             'eye: missing, expected eye and target, or framing = "auto"',

@@ -940,3 +940,17 @@ def test_a_compiled_renderer_is_one_and_the_compiler_is_not_imported_before():
     program = "import sys, warpshadow.torch; print('torch._dynamo' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [("albedo", {0: torch.tensor([200.0, 90.0, 30.0])}), ("textures", {1: torch.full((4, 4, 3), 180.0)})],
+)
+def test_colors_from_0_to_255_are_refused_as_those_of_bodies_are(renderer, argument, value):
+    message = rf"^{argument}\[\d\]: got values from .*, expected reflectances in \[0, 1\], linear: those of sRGB colors"
+    with pytest.raises(ValueError, match=message):
+        renderer(**{argument: value})
+
+
+def test_an_albedo_that_a_step_took_out_of_its_range_is_drawn(renderer):
+    assert renderer(albedo={0: torch.tensor([1.3, -0.2, 4.0])}).isfinite().all()

@@ -61,7 +61,7 @@ def check_coefficients(name: str, values: np.ndarray) -> None:
 
 @check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
-class EnvironmentMap:
+class EnvironmentMap(metaclass=check.Hinting):
     """Light from all around, as an equirectangular map, validated; arrays are read-only copies.
 
     It comes from infinitely far away; or with a radius from a sphere around the scene, the *shell*, such as the walls
@@ -361,11 +361,11 @@ def _check_aspect(pixels: np.ndarray) -> None:
         )
     height, width, _ = pixels.shape
     if width != 2 * height:
-        faces_or_crosses = [(6, 1), (1, 6), (4, 3), (3, 4)]
-        is_cube = any(width * down == height * columns for columns, down in faces_or_crosses)
-        cube = ", which looks like a cube map" if is_cube else ""
+        cube_maps = {6: "looks like a cube map", 4 / 3: "looks like a cube map or a photograph"}
+        kind = cube_maps.get(max(width, height) / min(width, height), "")
         raise ImageError(
-            f"radiance: got {width} x {height} pixels{cube}, expected an equirectangular map, twice as wide as high"
+            f"radiance: got {width} x {height} pixels{kind and f', which {kind}'}, expected an equirectangular map, "
+            "360° wide and 180° high, so twice as wide as high"
         )
 
 

@@ -254,6 +254,14 @@ class Mesh:
         return topology.rounds_edges(self.surface, self.positions)
 
     @functools.cached_property
+    def edge_rounding(self) -> float:
+        """Mean length, over its surface, of the differences of its normals from the normals of :meth:`creased`."""
+        corners = self.positions[self.faces]
+        first, second = (topology.corner_normals(corners, faces) for faces in (self.faces, self.creased().faces))
+        areas = np.linalg.norm(area_normals(corners.astype(np.float64)), axis=1)
+        return float(areas @ np.linalg.norm(first - second, axis=2).mean(axis=1) / areas.sum())
+
+    @functools.cached_property
     def creases(self) -> np.ndarray:
         """Edges across which normals jump, 2ᵏ for that opposite to corner k of each face, int32 of shape [face]."""
         return topology.creases(self.surface, self.positions)

@@ -229,6 +229,13 @@ def face_normals(corners: np.ndarray) -> np.ndarray:
     return normals / np.where(lengths > 0, lengths, 1)
 
 
+def corner_normals(corners: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals at the corners of faces [face, corner, 3], of the vertices at these, float64 of the same shape."""
+    normals = np.zeros((int(faces.max()) + 1, 3))
+    np.add.at(normals, faces, area_normals(corners.astype(np.float64))[:, None])
+    return (normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300))[faces]
+
+
 class MeshTopology(NamedTuple):
     """Topology of a mesh: how its faces are joined, and the volume they enclose.
 

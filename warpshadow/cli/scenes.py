@@ -133,7 +133,7 @@ def tune(
         Any,
         typer.Option(
             help="How often light bounces in the reference, such as 12; then 0 to 4 bounces are tried, which takes "
-            "some five to ten minutes in place of one.",
+            "several times as long.",
             parser=count_of_bounces,
             metavar="INTEGER|all",
         ),

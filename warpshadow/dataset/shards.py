@@ -111,10 +111,10 @@ def _render(data_set: DataSet, number: int) -> _Rendered:
 def _warn_once(remarks: list[str], number: int, warned_kinds: set[str]) -> None:
     """Give each warning once for all images, ignoring names and numbers."""
     for remark in remarks:
-        kinds = {re.sub(r"'[^']*'|[\d.]+", "", part) for part in remark.split("; ")}
-        if not kinds <= warned_kinds:
+        kind = re.sub(r"'[^']*'|[\d.]+", "", remark)
+        if kind not in warned_kinds:
             check.warn(f"image {number}: {remark}")
-        warned_kinds.update(kinds)
+        warned_kinds.add(kind)
 
 
 def _render_all(data_set: DataSet, numbers: Sequence[int], workers: int) -> Generator[_Rendered, None, None]:

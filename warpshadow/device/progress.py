@@ -100,7 +100,8 @@ class Wait:
         self.label, self.total, self.unit, self.done, self.patience = label, total, unit, done, patience
         self.remark = ""
         self.bar: Any = None  # tqdm's, where it shows one
-        self._before, self._start = done, time.monotonic()
+        self._start = time.monotonic()
+        self._before, self._label_start = done, self._start  # of the work that the label names
 
     @property
     def age(self) -> float:
@@ -125,7 +126,9 @@ class Wait:
             self.bar.refresh()
 
     def describe(self, label: str, remark: str = "") -> None:
-        """Label the bar, from its next update, with the work under way and a remark on it."""
+        """Label the bar, from its next update, with the work under way, which has a pace of its own, and a remark."""
+        if label != self.label:
+            self._before, self._label_start = self.done, time.monotonic()
         self.label, self.remark = label, remark
         if self.bar is not None:
             self.bar.set_description_str(label, refresh=False)
@@ -137,7 +140,8 @@ class Wait:
         if self.unit and self.total is not None:
             parts.insert(0, f"{self.done:,} of {self.total:,} {self.unit}s")
             if self.done > self._before:
-                left = self.age * max(self.total - self.done, 0) / (self.done - self._before)
+                age = time.monotonic() - self._label_start
+                left = age * max(self.total - self.done, 0) / (self.done - self._before)
                 parts.append(f"{show_time(left)} left")
         if self.remark:
             parts.append(self.remark)

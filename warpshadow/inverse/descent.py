@@ -457,7 +457,7 @@ def _descend(
     if state is not None and state["reason"] is None:
         remark(f"going on from iteration {done}, of {checkpoint}", shows=progress)
     total, label = done + descent.iterations_left(), "preparing: kernels, shadows, form factors"
-    with progress_bar(total, label, "it", done=done, shows=progress, stays=True) as bar:
+    with progress_bar(total, label, "iteration", done=done, shows=progress, stays=True) as bar:
         start = time.perf_counter()
         for _ in descent.run():
             current_time = time.perf_counter()
@@ -469,8 +469,9 @@ def _descend(
                 with torch.no_grad():
                     write_preview(preview, descent.model.targets, descent.model.images(descent.values))
                 preview_time = time.perf_counter()
-            bar.describe("fitting", f"stage {descent.stage + 1}, loss {descent.losses[-1][-1]:.3e}")
             bar.update()
+            stage_text = f"stage {descent.stage + 1} of {len(descent.stages)}"
+            bar.describe("fitting", f"{stage_text}, loss {descent.losses[-1][-1]:.3e}")
             bar.expect(descent.iterations_left())
             if watch is not None and not watch.update(descent, save):
                 break

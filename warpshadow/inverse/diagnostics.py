@@ -5,10 +5,12 @@ exposure, images that are not explained, a loss that was still falling.
 import math
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 import torch
 
 from warpshadow import check
 from warpshadow.inverse.free.base import Values
+from warpshadow.inverse.free.emission import Emission
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.reflectance import Albedo, Texture
@@ -18,6 +20,7 @@ from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.world import Setting
+from warpshadow.scene.remarks import is_out_of_frame
 
 MAX_UNSEEN_SHARE = 0.01  # share of the counted pixels that may see no body without a warning
 
@@ -114,15 +117,14 @@ def warn_of(
 def warn_before(problem: Problem) -> None:
     """Warn of parameters that images do not tell apart.
 
-    These are the light, the exposure and the reflectance of all bodies; and, by one image, a pose and the texture of
+    These are factors of all images, of which all but one have to be known; and, by one image, a pose and the texture of
     another body, which may keep any shadow.
     """
-    known_bodies = set(range(len(problem.scene.bodies))) - {free.number for free in problem.free_of(Albedo)}
-    known_bodies -= {free.number for free in problem.free_of(Texture)}
-    if {Light.key, Exposure.key} <= {free.key for free in problem.free} and not known_bodies:
+    factors = _free_factors(problem)
+    if len(factors) > 1:
         check.warn(
-            "free: got light, exposure and the reflectance of all bodies, expected one of these to be known: images "
-            "show their product alone, so each may be wrong by any factor; leave out Exposure, or a body's Albedo",
+            f"free: got {' and '.join(factors)}, expected all but one of them to be known: images show their product "
+            f"alone, so each may be wrong by any factor; {'; or '.join(filter(None, factors.values()))}",
             DiagnosticWarning,
         )
     poses = {pose.number for pose in problem.free_of(Pose)}
@@ -138,10 +140,33 @@ def warn_before(problem: Problem) -> None:
             )
 
 
+def _free_factors(problem: Problem) -> dict[str, str]:
+    """Name the free parameters that are factors of all images, and how each becomes known.
+
+    The exposure is one; the light, where all that shines is free; and the reflectance of the bodies that cameras see,
+    where that of all is free, and neither gloss, lamps that are seen nor bounces, where it counts twice, tell it.
+    """
+    scene, cameras, names = problem.scene, problem.cameras(), {free.name for free in problem.free}
+    seen = {k: b for k, b in enumerate(scene.bodies) if not all(is_out_of_frame(b, camera) for camera in cameras)}
+    is_map_known = Light.key not in names and np.any(scene.known_light.radiance)
+    lamps = [number for number, body in enumerate(scene.bodies) if body.is_emitter and np.any(body.emission)]
+    is_light_free = not is_map_known and {Emission(lamp).name for lamp in lamps} <= names
+    is_determined = scene.bounces or any(body.is_glossy or body.is_emitter for body in seen.values())
+    factors = {
+        "light": is_light_free and "",
+        "exposure": any(exposure.reference is None for exposure in problem.free_of(Exposure))
+        and "leave out Exposure(), or of several views keep one's, Exposure(reference=0)",
+        "the reflectance of all bodies": not is_determined
+        and all({Albedo(number).name, Texture(number).name} & names for number in seen)
+        and "leave out the Albedo or Texture of a body that is known",
+    }
+    return {name: remedy for name, remedy in factors.items() if remedy is not False}
+
+
 def _warn_of_unseen(model: Model, images: torch.Tensor) -> bool:
     """Warn of pixels without a body; return whether there are."""
     share = unseen_share(model, images)
-    if share > MAX_UNSEEN_SHARE:
+    if MAX_UNSEEN_SHARE < share < 1:  # of cameras that see nothing images warn
         check.warn(
             f"{share:.0%} of the counted pixels see no body, and are explained as black; mask them out, or make the "
             "ground larger",

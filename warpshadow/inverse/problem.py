@@ -23,10 +23,12 @@ from warpshadow.inverse.free.pose import Pose
 from warpshadow.inverse.free.reflectance import Albedo, Texture
 from warpshadow.inverse.free.shape import Deformation, Radii
 from warpshadow.inverse.free.sun import Sun
+from warpshadow.inverse.free.views import Exposure
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import FittedScene, Setting
 from warpshadow.scene.blockers import blocking_planes, scene_blockers
+from warpshadow.scene.remarks import is_out_of_frame
 from warpshadow.scene.scene import Scene, change_bodies, check_scene
 from warpshadow.scene.visibility import METHODS, SPHERE_METHODS, Visibility
 from warpshadow.tuning.tune import resolved
@@ -99,7 +101,11 @@ class Problem:
         for number, target in enumerate(self.targets):
             for outlined in target.outlines:
                 self.scene.body_number(outlined, f"targets[{number}].outlines")
-        self.cameras()  # raises for an image of other proportions
+        cameras = self.cameras()  # raises for an image of other proportions
+        if not self.moves and all(is_out_of_frame(body, camera) for body in self.scene.bodies for camera in cameras):
+            raise ValueError(
+                "targets: got cameras that see no body, expected one that does, since neither bodies nor cameras move"
+            )
 
     def __repr__(self) -> str:
         free = ", ".join(free.name for free in self.free)
@@ -117,6 +123,9 @@ class Problem:
             raise ValueError(f"free: got {twice[0]} twice, expected it once")
         if {Light.key, Sun.key} <= set(names):
             raise ValueError("free: got Light and Sun, expected one of them: free light has any sun in it")
+        for exposure in self.free_of(Exposure):
+            if exposure.reference is not None:
+                check.index("reference", exposure.reference, len(self.targets), "view")
         for body in range(len(self.scene.bodies)):
             if {Albedo(body).name, Texture(body).name} <= set(names):
                 raise ValueError(f"free: got Albedo({body}) and Texture({body}), expected one of them for a body")
@@ -126,7 +135,7 @@ class Problem:
     def _of_images(self) -> Iterator[Target]:
         for number, item in enumerate(self.targets):
             with check.located(f"targets[{number}]"):
-                yield Target(item) if isinstance(item, np.ndarray) or check.is_path(item) else item
+                yield Target(item) if hasattr(item, "shape") or check.is_path(item) else item
 
     def _numbered(self) -> Iterator[Free]:
         for number, item in enumerate(self.free):

@@ -164,12 +164,13 @@ def _describe_shift(before: Body, after: Body) -> str:
     """How far the middle of a body moved: a translation is of the origin of its mesh, maybe far from it."""
     low, high = (corner.astype(np.float64) for corner in before.mesh.bounds)
     middle = (low + high) / 2
-    return f": its middle moved by ({_format_numbers(after.to_world(middle) - before.to_world(middle))})"
+    shift = after.to_world(middle) - before.to_world(middle)
+    return f" scene units, its middle moved by ({_format_numbers(shift)})"
 
 
 def found_values(result: Result) -> list[str]:
-    """Describe the changes of a fit, a line each: poses, materials, exposures, and light: whence, and how far away."""
-    lines, start, scene = [], result.problem.scene, result.scene
+    """Describe the changes of a fit, a line each, their values below each other: poses, materials, exposures, light."""
+    rows, start, scene = list[tuple[str, str]](), result.problem.scene, result.scene
     for before, after in zip(start.bodies, scene.bodies, strict=True):
         for name in ("translation", "rotation", "scale", "albedo", *GLOSS_ARGUMENTS, "emission"):
             values = np.asarray(getattr(after, name))
@@ -179,19 +180,20 @@ def found_values(result: Result) -> list[str]:
                 and values.size <= 3
             ):
                 remark = {"rotation": "°", "translation": _describe_shift(before, after)}.get(name, "")
-                lines.append(f"{after.name}: {name} ({_format_numbers(values)}){remark}")
+                rows.append((f"{after.name} {name}", f"({_format_numbers(values)}){remark}"))
     if scene.light is not start.light:
         radiance = scene.known_light.radiance
         directions = sh.equirectangular_directions(len(radiance)).astype(np.float32)
         x, y, z = directions.reshape(-1, 3)[radiance.sum(axis=2).argmax()]
-        lines.append(f"light: strongest from ({x:.3f}, {y:.3f}, {z:.3f})")
+        rows.append(("light", f"strongest from ({x:.3f}, {y:.3f}, {z:.3f})"))
     for name, value in result.found.sun.items():
-        lines.append(f"sun: {name} ({_format_numbers(value)}){'°' if name == 'angular_radius' else ''}")
+        rows.append((f"sun {name}", f"({_format_numbers(value)}){'°' if name == 'angular_radius' else ''}"))
     if scene.shell is not None and start.shell is not None and scene.shell[3] != start.shell[3]:
-        lines.append(f"light: radius {scene.shell[3]:.4g}")
+        rows.append(("light radius", f"{scene.shell[3]:.4g} scene units"))
     if any(factor != 1 for factor in result.found.exposures):
-        lines.append(f"exposure: {_format_numbers(result.found.exposures)}")
-    return lines
+        rows.append(("exposure", f"{_format_numbers(np.log2(result.found.exposures))} stops"))
+    width = max((len(name) for name, _ in rows), default=0)
+    return [f"{name:{width}}  {text}" for name, text in rows]
 
 
 def _evaluate(model: Model, values: dict[str, Values]) -> tuple[float, np.ndarray]:

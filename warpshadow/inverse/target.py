@@ -88,7 +88,7 @@ class Target:
             path = check.file("mask", mask)
             with check.located("mask"):
                 object.__setattr__(self, "mask", read_mask(path))
-        image = check.pixels("image", self.image, expected="linear RGB [height, width, 3], or the path of a picture")
+        image = check.photograph("image", self.image)
         if image.ndim != 3 or image.shape[2] not in (3, 4) or image.size == 0:
             remedy = check.channels_last(image.shape)
             raise ValueError(

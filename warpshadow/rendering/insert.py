@@ -91,7 +91,7 @@ def _linear_photograph(photograph: npt.ArrayLike | AnyPath) -> np.ndarray:
         path = check.file("photograph", photograph)
         with check.located("photograph", ImageError):
             return read_rgb(path)
-    pixels = check.pixels("photograph", photograph, expected="linear RGB [height, width, 3], or the path of a picture")
+    pixels = check.photograph("photograph", photograph)
     check.shape("photograph", pixels.shape, ("height", "width", 3), check.channels_last(pixels.shape))
     check.finite("photograph", pixels)
     return pixels

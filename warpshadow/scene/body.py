@@ -31,9 +31,6 @@ VALUES_SUFFIX = ".npy"  # suffix of files with a number for each vertex
 
 _SPHERES_SUFFIX = ".npz"
 
-LIKELY_MISTAKES = {"color": "albedo", "colour": "albedo", "position": "translation"}
-"""Replacements for likely mistakes in a body's arguments, and keys."""
-
 
 @check.frozen()
 @dataclass(frozen=True, eq=False, init=False)
@@ -106,7 +103,7 @@ class Body:
     emission: np.ndarray | None
     beam: tuple[float, float] | None
 
-    @check.keywords(**LIKELY_MISTAKES, spheres="blockers", path="mesh", size="Body(…).on_ground(size=…)")
+    @check.keywords(spheres="blockers", size="Body(…).on_ground(size=…)")
     def __init__(
         self,
         mesh: Mesh | MeshSource,

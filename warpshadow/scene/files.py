@@ -25,7 +25,7 @@ from warpshadow.assets.sky import synthetic_sky
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
-from warpshadow.scene.body import COLORS_SUFFIX, LIKELY_MISTAKES, VALUES_SUFFIX, Body
+from warpshadow.scene.body import COLORS_SUFFIX, VALUES_SUFFIX, Body
 from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import Bounces, Scene, check_bounces, check_scene, check_supersampling
 from warpshadow.scene.toml_tables import Table
@@ -139,8 +139,6 @@ def _check_keys(name: str, table: Table, known: Iterable[str] = (), *, noun: str
         others = [] if is_typo else [other for other, keys in _KEYS.items() if key in keys]
         if key not in known and others and name not in others:
             raise ValueError(f"got {key}, expected it in {' or '.join(others)}")
-        if key not in known and LIKELY_MISTAKES.get(key) in known:
-            raise ValueError(f"unknown {noun} {key!r} (did you mean {LIKELY_MISTAKES[key]!r}?)")
     check.known_keys("", table, known, noun=noun)
 
 
@@ -250,6 +248,8 @@ def _body(table: Table, folder: Path) -> Body:
         return body.on_ground(body.translation) if on_ground else body
     check.instance("on_ground", on_ground, Mapping, "true or false, or a table such as {size = 2.0}")
     with check.located("on_ground"):
+        if "foot" in on_ground:
+            raise ValueError(f"foot: got {on_ground['foot']!r}, expected it as translation, a key of the body")
         check.known_keys("", on_ground, ("size",))
         if "size" in on_ground and "scale" in table:
             raise ValueError("size: got it beside the body's scale, expected one of them")

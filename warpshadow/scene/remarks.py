@@ -1,5 +1,5 @@
-"""Remarks on a scene: where bodies stand, normals that show as lines or dark edges, light that is blurred or
-hidden, metals that are black.
+"""Remarks on a scene: where bodies and cameras stand, normals that show as lines or dark edges, light that is blurred
+or hidden, metals that are black.
 """
 
 from collections.abc import Iterable
@@ -20,6 +20,8 @@ _CEILING_RATIO = 1.01  # ratio of breadths up to which a body is as broad as its
 _SUN_SHARE = 0.01  # of all directions, from which half of the light comes where there is a sun
 _ONE_SUN = 0.99  # length of the mean direction of that light from which on it is one sun: two are apart
 _LOW_SUN = -0.02  # height of the direction to a sun from which on it is below the horizon, by more than its rim
+_MARGIN = 3.0  # breadths of the frame around its middle in which a body's shadow may be meant to be seen alone
+_ROUNDED = 0.08  # mean difference of normals from which rounded edges are said
 _METAL = 0.5  # share of metal from which a body is one
 
 
@@ -134,6 +136,28 @@ def enclosures(scene: Scene, cameras: Iterable[Camera]) -> list[str]:
     return []
 
 
+def is_out_of_frame(body: Body, camera: Camera, margin: float = 1.0) -> bool:
+    """Whether a body lies beyond one side of a frame of so many breadths, or behind the camera's near plane."""
+    x, y, _, depth = (np.column_stack([(p := body.world_points()), np.ones(len(p))]) @ camera.clip_matrix().T).T
+    is_behind = depth <= camera.near
+    sides = [side > margin * depth for side in (x, -x, y, -y)]
+    return any(bool(is_beyond.all()) for is_beyond in (is_behind, *sides))
+
+
+def unframed(scene: Scene, cameras: Iterable[Camera]) -> list[str]:
+    """Remark on the first camera that has none of the bodies but grounds and lamps in its frame or near it."""
+    pairs = zip(scene.bodies, _boxes_of(scene), strict=True)
+    others = [body for body, box in pairs if not body.is_emitter and not _is_ground(body, box)]
+    for camera in cameras:
+        if others and all(is_out_of_frame(body, camera, _MARGIN) for body in others):
+            names = ", ".join(repr(body.name) for body in others)
+            return [
+                f"camera: got one that sees the ground alone, expected {names} in its frame or near it; "
+                'Camera.framing(scene), or framing = "auto" in a scene file, shows all'
+            ]
+    return []
+
+
 def _is_ground(body: Body, box: _Box) -> bool:
     size, mesh = box.high - box.low, body.mesh
     if body.is_emitter or size[1] > 0.2 * size.max():  # at once: most bodies are not flat
@@ -143,12 +167,16 @@ def _is_ground(body: Body, box: _Box) -> bool:
 
 
 def rounded_edges(scene: Scene) -> list[str]:
-    """Say which bodies have many sharp edges whose faces share vertices, and so normals."""
+    """Say which bodies have many sharp edges whose faces share vertices, and so normals, where much of them shows it.
+
+    Vases of 16 to 128 sides, where it is the lip, have up to 0.065 and are up to 5% off; a box of 3,000 faces 0.093 and
+    17%, a bottle of flat shoulders 0.21 and 9%, a cube 0.87 and 50%.
+    """
     return [
         f"body {number} ({body.name!r}) has sharp edges whose faces share vertices, and so normals, which make them "
         f"dark or bright; Body(…).creased(), in scene files and recipes creased = {CREASE:g}, parts them"
         for number, body in enumerate(scene.bodies)
-        if body.mesh.rounds_edges
+        if body.mesh.rounds_edges and body.mesh.edge_rounding > _ROUNDED
     ]
 
 

@@ -28,7 +28,9 @@ def rotation_vector(value: npt.ArrayLike) -> np.ndarray:
         )
     if matrix.shape != (3, 3):
         vector = check.array("rotation", value, (3,), meaning)
-        _warn_of_radians(vector)
+        is_checked = isinstance(value, np.ndarray) and not value.flags.writeable  # of a body that is replaced
+        if not is_checked:
+            _warn_of_radians(vector)
         return vector
     from scipy.spatial.transform import Rotation
 

@@ -246,10 +246,10 @@ def tune(
     settings = [setting for item in scenes_with_bounces for setting in _trial_scenes(item, fine, fits, device)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a setting's warnings show in its error
-        errors = []
-        with progress_bar(len(settings), "measuring errors", "setting", shows=progress) as bar:
-            for setting in settings:
-                errors.append(sample.error(sample.shading(setting)))
+        errors = [0.0] * len(settings)
+        with progress_bar(len(settings), "measuring errors, before times", "setting", shows=progress) as bar:
+            for number in np.random.default_rng(0).permutation(len(settings)).tolist():  # slow ones come last otherwise
+                errors[number] = sample.error(sample.shading(settings[number]))
                 bar.update()
         if progress:  # timing takes as long again, and may be interrupted
             print(_error_table(settings, errors, fitted_counts(scene)), file=sys.stderr)

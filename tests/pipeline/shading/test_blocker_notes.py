@@ -36,7 +36,12 @@ def test_each_body_has_a_line_with_its_kind_and_reason():
 
 def test_cloth_blocks_as_panels():
     tent, _ = notes([ws.Body(shapes.tent()), GROUND], method="directional")
-    assert "convex parts, and its own by rays, traced once" in tent
+    assert "convex parts: it is made of few panels, and its own by rays, traced once" in tent
+
+
+def test_a_box_that_is_to_trace_its_own_shadow_blocks_as_a_part_of_which_it_is_made():
+    (box, _) = notes([BOX, GROUND], self_shadows="rays")
+    assert "as 1 convex part: it is made of few of them, and its own by rays" in box
 
 
 def test_methods_without_shadows_say_nothing_and_log_sh_has_spheres_alone():

@@ -21,14 +21,19 @@ class Exposure(Free):
 
     Args:
         white_balance: Whether the gains of red and blue are free, too; that of green is 1.
+        reference: Number of a view whose exposure and gains stay 1, from 0: beside free light, which is then in its
+            unit. None for none.
     """
 
     key = "exposure"
 
     white_balance: bool = False
+    reference: int | None = None
 
     def __post_init__(self) -> None:
         check.flag("white_balance", self.white_balance)
+        if self.reference is not None:
+            check.integer("reference", self.reference, minimum=0)
 
     def start(self, setting: Setting) -> Values:
         views = len(setting.cameras)
@@ -39,14 +44,21 @@ class Exposure(Free):
         """Gains of red, green and blue, [view, 3]; or of all, [view, 1]."""
         if not self.white_balance:
             return torch.ones_like(values["log"])[:, None]
-        red, blue = values["log_white"].exp().unbind(dim=1)
+        red, blue = self._factors(values["log_white"]).unbind(dim=1)
         return torch.stack([red, torch.ones_like(red), blue], dim=1)
 
+    def _factors(self, logarithms: torch.Tensor) -> torch.Tensor:
+        """Factors of views, [view, …]; 1 of the reference."""
+        is_free = torch.ones_like(logarithms)
+        if self.reference is not None:
+            is_free[self.reference] = 0
+        return (is_free * logarithms).exp()
+
     def apply(self, values: Values, setting: Setting, world: World) -> None:
-        world.exposures = values["log"].exp()[:, None] * self._gains(values)
+        world.exposures = self._factors(values["log"])[:, None] * self._gains(values)
 
     def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        fitted.exposures = values["log"].exp().tolist()
+        fitted.exposures = self._factors(values["log"]).tolist()
         if self.white_balance:
             fitted.white_balances = [tuple(gains) for gains in self._gains(values).tolist()]
 

@@ -30,6 +30,9 @@ BodyArrays = Sequence[wp.array | None] | None
 _LIMITS = {field.name: (field.minimum, field.maximum) for field in MATERIAL_FIELDS} | {"emission": (0.0, check.LARGEST)}
 
 
+_MIN_CODE = 5.0  # mean from which on colors are codes from 0 to 255, and not reflectances that left [0, 1] in a fit
+
+
 class SampleReflectance(NamedTuple):
     """Nodes of the samples' reflectance."""
 
@@ -211,11 +214,15 @@ class Materials:
         minimum, maximum = _LIMITS.get(name, (-check.LARGEST, check.LARGEST))
         finite_arrays({where: array}, minimum=minimum, maximum=maximum)
         if name in ("albedo", "textures"):
-            self._warn_of_growth(where, array)
+            self._check_colors(where, array)
 
-    def _warn_of_growth(self, name: str, values: wp.array) -> None:
-        """Say, where the host need not wait for it, that more light is reflected than falls in; Python says it once."""
-        if self.merged_scene.scene.bounces and is_readable(values.device) and values.numpy().max(initial=0.0) > 1:
+    def _check_colors(self, name: str, values: wp.array) -> None:
+        """Refuse codes of a picture, and warn where light would grow, if the host need not wait for the values."""
+        colors = values.numpy() if is_readable(values.device) else np.zeros(0)
+        largest = colors.max(initial=0.0)
+        if largest > _MIN_CODE and colors.mean() > _MIN_CODE:
+            check.reflectance(name, colors)
+        if self.merged_scene.scene.bounces and largest > 1:
             check.warn(
                 f"{name}: got values above 1, with which light grows with each bounce, expected reflectances in "
                 "[0, 1]; clamp them after each step of an optimizer, or free the input of a sigmoid"

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 import numpy as np
 import warp as wp
 
+from warpshadow.maths.convex import is_panel
 from warpshadow.pipeline.bodies.convex import SceneConvexParts
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
@@ -144,7 +145,8 @@ class SceneBlockers:
         why = kinds.why_spheres[body] if kinds.why_spheres else "the method looks up no rays"
         of_its_own = f"and its own by {f'spheres: {why}' if why else 'rays, traced once'}"
         if body in kinds.convex:
-            return f"{parts}, {of_its_own}"
+            has_panels = any(map(is_panel, self.parts.parts[body]))
+            return f"{parts}: it is made of few {'panels' if has_panels else 'of them'}, {of_its_own}"
         count = int(self._merged_scene.sphere_counts[body])
         spheres = f"as {count} sphere{'s' * (count != 1)}"
         if why == FREE_SHAPE:

@@ -15,22 +15,24 @@ from warpshadow.scene.remarks import (
     misplacements,
     rounded_edges,
     sun_below,
+    unframed,
 )
 
 
 def warn_of_view(view: View, cameras: Sequence[Camera] | None) -> bool:
-    """Warn of an image that shows nothing, and of likely mistakes in the scene where its own cameras are given.
+    """Warn of an image that shows nothing, and of each likely mistake in the scene where its own cameras are given.
 
     Returns:
         Whether there was anything to warn of.
     """
     remarks, scene = [view.emptiness()], view.merged_scene.scene
     if cameras is not None:
+        remarks += [] if remarks[0] else unframed(scene, cameras)
         remarks += [*enclosures(scene, cameras), *misplacements(scene), *rounded_edges(scene), *lined_surfaces(scene)]
         remarks += [*blurred_shell(scene), *sun_below(scene), *black_metals(scene)]
-    if result := [remark for remark in remarks if remark]:
-        check.warn("; ".join(result))
-    return bool(result)
+    for remark in filter(None, remarks):
+        check.warn(remark)
+    return any(remarks)
 
 
 def warn_of_vertex_receivers(view: View, bodies: Sequence[Body], camera: Camera) -> None:
