@@ -18,16 +18,20 @@ def medial_balls(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> 
     """
     tangent_points, normals = mesh.sample(count, rng)
     radii = np.full(count, 0.5)
+    shrinking = np.arange(count)  # balls that are too large so far
     for _ in range(12):
-        centers = tangent_points - radii[:, None] * normals
+        points, axes, large_radii = tangent_points[shrinking], normals[shrinking], radii[shrinking]
+        centers = points - large_radii[:, None] * axes
         nearest = mesh.nearest(centers)
-        chord = nearest - tangent_points
-        depth = np.maximum(-2 * (chord * normals).sum(axis=1), 1e-9)
-        shrinks = np.linalg.norm(nearest - centers, axis=1) < 0.98 * radii - 1e-5
+        chord = nearest - points
+        depth = np.maximum(-2 * (chord * axes).sum(axis=1), 1e-9)
+        shrinks = np.linalg.norm(nearest - centers, axis=1) < 0.98 * large_radii - 1e-5
         shrinks &= np.linalg.norm(chord, axis=1) > 1e-4
         if not shrinks.any():
             break
-        radii = np.where(shrinks, np.minimum(radii, np.maximum((chord**2).sum(axis=1) / depth, 1e-3)), radii)
+        smaller = np.minimum(large_radii, np.maximum((chord**2).sum(axis=1) / depth, 1e-3))
+        shrinking = shrinking[shrinks]
+        radii[shrinking] = smaller[shrinks]
     centers = tangent_points - radii[:, None] * normals
     radii = -mesh.signed_distances(centers)[0]
     return np.column_stack([centers, radii])[radii > 1e-3]

@@ -7,15 +7,15 @@ import warp as wp
 import warpshadow as ws
 from warpshadow.device.lanes import lane_type, module_options, vectors_type
 from warpshadow.maths.directions import fibonacci
-from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open
-from warpshadow.stages.rays.ray_tracing import trace_visibility
+from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, Hits, build_face_tree, make_find_first, make_find_open
+from warpshadow.stages.rays.ray_tracing import first_hit, trace_visibility
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
 # Of so many rays some pass so near to an edge that float32 and float64 differ.
 NEAR_EDGES = 2e-4
 
-Lane, Vectors, find_open = lane_type(PACKET), vectors_type(PACKET), make_find_open()
+Lane, Vectors, find_open, find_first = lane_type(PACKET), vectors_type(PACKET), make_find_open(), make_find_first()
 
 
 @wp.kernel(module="unique", module_options=module_options(PACKET), enable_backward=False)
@@ -31,6 +31,30 @@ def trace(
     toward = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
     open_rays, _face = find_open(tree, points[point], normals[point], toward, wanted[point, packet], -1)
     found[point, packet] = open_rays
+
+
+@wp.kernel(module="unique", module_options=module_options(PACKET), enable_backward=False)
+def meet(
+    mesh: wp.uint64,
+    tree: FaceTree,
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    directions: wp.array2d(dtype=Lane),
+    by_packets: wp.array2d(dtype=Hits),
+    by_rays: wp.array2d(dtype=Hits),
+):
+    point, packet = wp.tid()
+    toward = Vectors(directions[packet, 0], directions[packet, 1], directions[packet, 2])
+    found = find_first(tree, points[point], normals[point], toward)
+    expected = Hits()
+    for lane in range(PACKET):
+        if found[lane] >= 0:
+            found[lane] = 2 * tree.face_ids[found[lane] // 2] + found[lane] % 2
+        ray = wp.vec3(toward.x[lane], toward.y[lane], toward.z[lane])
+        hit = first_hit(mesh, points[point], normals[point], ray)
+        expected[lane] = wp.where(hit.face < 0, -1, 2 * hit.face + wp.where(hit.is_back, 1, 0))
+    by_packets[point, packet] = found
+    by_rays[point, packet] = expected
 
 
 def knot() -> tuple[np.ndarray, np.ndarray]:
@@ -72,11 +96,39 @@ def test_packets_meet_what_single_rays_meet(device, face_count):
         assert 0.2 < expected[is_up].mean() < 0.8
 
 
+def test_packets_meet_the_first_faces_that_single_rays_meet(device):
+    positions, faces = knot()
+    rng = np.random.default_rng(0)
+    corners = positions[faces][::3]
+    on_faces = np.einsum("fk,fkx->fx", rng.dirichlet([1, 1, 1], len(corners)), corners)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    tilted = normals / np.linalg.norm(normals, axis=1, keepdims=True) + rng.normal(scale=0.2, size=normals.shape)
+    inner = rng.uniform(-0.5, 0.5, size=(100, 3))
+    points = np.concatenate([on_faces, inner]).astype(np.float32)
+    normals = np.concatenate([tilted, rng.normal(size=inner.shape)])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    directions = fibonacci(512)
+    mesh = wp.Mesh(
+        wp.array(positions, dtype=wp.vec3, device=device), wp.array(faces.ravel(), dtype=wp.int32, device=device)
+    )
+    lanes = wp.array(directions.reshape(-1, PACKET, 3).swapaxes(1, 2), dtype=Lane, device=device)
+    places, facing = (wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals))
+    outputs = [wp.empty((len(points), len(lanes)), dtype=Hits, device=device) for _ in range(2)]
+    inputs = [mesh.id, build_face_tree(positions, faces, device), places, facing, lanes]
+    wp.launch(meet, dim=outputs[0].shape, inputs=inputs, outputs=outputs, device=device)
+    is_up = normals @ directions.T > 0  # packets leave out faces below the horizon
+    found, expected = (array.numpy().reshape(is_up.shape)[is_up] for array in outputs)
+    assert (found != expected).mean() < NEAR_EDGES
+    assert 0.1 < (expected >= 0).mean() < 0.9
+    assert set(expected[expected >= 0] % 2) == {0, 1}
+
+
 def test_every_face_is_in_a_leaf_and_within_its_boxes():
     positions, faces = knot()
     tree = build_face_tree(positions, faces)
     corners, lowers, uppers = (array.numpy() for array in (tree.corners, tree.lowers, tree.uppers))
     given = positions[faces].reshape(len(faces), -1)
+    np.testing.assert_array_equal(corners, positions[faces[tree.face_ids.numpy()]])
     np.testing.assert_array_equal(np.unique(corners.reshape(len(faces), -1), axis=0), np.unique(given, axis=0))
     for face, points in enumerate(corners):
         box = tree.leaf_count + next(

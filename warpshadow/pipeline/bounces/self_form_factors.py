@@ -21,7 +21,7 @@ from warpshadow.stages.sparse import SparseMatrix
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-VERSION = 2  # part of the key of cached form factors: raise it whenever they would come out differently
+VERSION = 3  # part of the key of cached form factors: raise it whenever they would come out differently
 _RAYS = 512  # rays of a probe
 
 

@@ -16,13 +16,11 @@ from warpshadow.maths.directions import check_count
 from warpshadow.maths.spatial_sort import compact_order
 from warpshadow.stages.bounces.bright_patches import BrightPatches, hit_weight, point_of_bright_side
 from warpshadow.stages.patches import Patches
-from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, build_face_tree, make_find_open, packets_of
+from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, build_face_tree, make_find_first, packets_of
 from warpshadow.stages.rays.ray_tracing import RAY_COST, first_hit, progress_slices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
-
-ALL_RAYS = wp.constant((1 << PACKET) - 1)  # of a packet, which traces at once which of them meet anything
 
 _Lane = lane_type(PACKET)
 
@@ -40,7 +38,7 @@ _BURIED_SHARE = 0.5
 
 @functools.cache
 def _make_sum_hits() -> wp.Kernel:
-    Vectors, find_open = vectors_type(PACKET), make_find_open()
+    Vectors, find_first = vectors_type(PACKET), make_find_first()
 
     @wp.kernel(module="unique", module_options=module_options(PACKET), enable_backward=False)
     def sum_hits(
@@ -75,7 +73,6 @@ def _make_sum_hits() -> wp.Kernel:
         u = wp.cos(turn) * tangent + wp.sin(turn) * bitangent
         v = wp.cos(turn) * bitangent - wp.sin(turn) * tangent
         ray_count = PACKET * lattice.shape[0]
-        last_face = int(-1)
         for packet in range(lattice.shape[0]):
             x = lattice[packet, 0]
             y = lattice[packet, 1]
@@ -85,18 +82,22 @@ def _make_sum_hits() -> wp.Kernel:
                 u[1] * x + v[1] * y + normal[1] * z,
                 u[2] * x + v[2] * y + normal[2] * z,
             )
-            open_rays, last_face = find_open(tree, point, normal, rays, ALL_RAYS, last_face)
-            if open_rays != ALL_RAYS:
-                for lane in range(PACKET):
-                    if (open_rays >> lane) & 1 == 0:
-                        ray_direction = wp.vec3(rays.x[lane], rays.y[lane], rays.z[lane])
-                        hit = first_hit(mesh, point, normal, ray_direction)
-                        if hit.face >= 0:
-                            patch = patch_of_sides[wp.where(hit.is_back, 1, 0), hit.face]
-                            if patch >= 0:
-                                hits[receiver, patch] += hit_weight(
-                                    bright, patch, corners, hit.face, point, normal, ray_direction, ray_count
-                                )
+            first_hits = find_first(tree, point, normal, rays)
+            for lane in range(PACKET):
+                if first_hits[lane] >= 0:
+                    face = tree.face_ids[first_hits[lane] // 2]
+                    patch = patch_of_sides[first_hits[lane] % 2, face]
+                    if patch >= 0:
+                        hits[receiver, patch] += hit_weight(
+                            bright,
+                            patch,
+                            corners,
+                            face,
+                            point,
+                            normal,
+                            wp.vec3(rays.x[lane], rays.y[lane], rays.z[lane]),
+                            ray_count,
+                        )
         for ray in range(bright.ray_count):
             share = (float(ray) + wp.randf(state)) / float(bright.ray_count)
             side, target = point_of_bright_side(bright, corners, share, wp.randf(state), wp.randf(state))
