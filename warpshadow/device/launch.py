@@ -13,10 +13,10 @@ from typing import Any
 import warp as wp
 
 from warpshadow.device import warp_internals
-from warpshadow.device.memory import in_huge_pages, require_gradient, reshaped
+from warpshadow.device.memory import in_huge_pages, require_gradient
 from warpshadow.device.parallel import Scratch, launch_adjoint_slices, launch_slices
 from warpshadow.device.tape import record_adjoint, record_kernel
-from warpshadow.device.warp_internals import scalar_type, viewed_array
+from warpshadow.device.warp_internals import contiguous_view, scalar_type, viewed_array
 
 
 def launch(
@@ -175,8 +175,10 @@ def without_gradient(array: wp.array) -> wp.array:
     """View an array without its gradient."""
     if not array.requires_grad:
         return array
-    view = reshaped(array, array.shape)
-    view.requires_grad = False
+    view = contiguous_view(array, array.shape, array.dtype, has_gradient=False)
+    if view is None:
+        view = array.reshape(array.shape)
+        view.requires_grad = False
     return view
 
 

@@ -15,11 +15,11 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.warp_internals import (
-    check_strides,
+    byte_count,
     contiguous_view,
     current_tape,
+    empty,
     item_shape,
-    new_array,
     scalar_type,
     set_gradient,
     viewed_array,
@@ -48,16 +48,11 @@ def in_huge_pages(array: wp.array) -> wp.array:
 
     It is a request: where the system refuses, memory comes in small pages as before.
     """
-    size = array.size * wp.types.type_size_in_bytes(array.dtype)
+    size = array.capacity
     if size >= _MIN_BYTES and array.device.is_cpu and (advise := _advise()) is not None:
         first, end = -(-array.ptr // _HUGE) * _HUGE, (array.ptr + size) // _HUGE * _HUGE
         advise(first, end - first, mmap.MADV_HUGEPAGE)
     return array
-
-
-def empty(shape: int | Sequence[int], dtype: type, device: wp.DeviceLike) -> wp.array:
-    """Make an array of uninitialized memory: ``wp.empty``, but quicker."""
-    return new_array(shape, dtype, device if isinstance(device, wp.Device) else wp.get_device(device))
 
 
 def zeros(
@@ -151,8 +146,7 @@ class ZeroedMemory:
 
     def take(self, shape: Sequence[int], dtype: type, device: wp.Device) -> wp.array:
         """Take an array of zeros."""
-        check_strides(shape, dtype)
-        size = -(-math.prod(shape) * wp.types.type_size_in_bytes(dtype) // _ALIGNMENT) * _ALIGNMENT
+        size = -(-byte_count(tuple(shape), dtype) // _ALIGNMENT) * _ALIGNMENT
         if not size or size > _MAX_SHARED:
             array = in_huge_pages(empty(shape, dtype, device))
             array.zero_()

@@ -19,7 +19,7 @@ import math
 import os
 import queue
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -151,18 +151,12 @@ def launch_slices(
     device: wp.Device,
 ) -> None:
     """Launch a kernel off the tape, on a CPU in slices that threads share; see :func:`.launch.launch`."""
-    rows = 0 if not scratch else thread_count() if device.is_cpu else math.prod(_shape(dim))
-    leading_arguments = [
-        *inputs,
-        *(empty((rows, *shape), dtype=dtype, device=device) for shape, dtype in scratch),
-        *outputs,
-    ]
-    summed_arguments = {
-        argument_index: array
-        for argument_index, array in enumerate(sums, 2 + len(leading_arguments))
-        if array is not None
-    }
-    _launch_slices(kernel, dim, cost, [*leading_arguments, *sums], summed_arguments, None, device)
+    dim = _shape(dim)
+    slice_count, workers = _count_slices(dim, cost, sums, device)
+    rows = min(workers, slice_count) if device.is_cpu else math.prod(dim)
+    arguments = [*inputs, *(empty((rows, *shape), dtype, device) for shape, dtype in scratch), *outputs]
+    summed_arguments = {index: array for index, array in enumerate(sums, 2 + len(arguments)) if array is not None}
+    _launch_slices(kernel, dim, [*arguments, *sums], summed_arguments, None, slice_count, workers, device)
 
 
 def launch_adjoint_slices(
@@ -180,27 +174,45 @@ def launch_adjoint_slices(
     Args:
         shared: Inputs to whose gradients all rows add.
     """
-    arguments = [*inputs, *outputs]
-    gradients = gradients_of(arguments)
+    dim, arguments = _shape(dim), [*inputs, *outputs]
     summed_arguments = {
-        argument_index: value.grad
-        for argument_index, value in enumerate(inputs, 2)
+        index: value.grad
+        for index, value in enumerate(inputs, 2)
         if isinstance(value, wp.array) and value.requires_grad and any(value is array for array in shared)
     }
-    _launch_slices(kernel, dim, cost, arguments, summed_arguments, gradients, device)
+    counts = _count_slices(dim, cost, summed_arguments.values(), device)
+    _launch_slices(kernel, dim, arguments, summed_arguments, gradients_of(arguments), *counts, device)
 
 
 def _shape(dim: int | Sequence[int]) -> Sequence[int]:
     return (dim,) if isinstance(dim, int) else dim
 
 
+def _count_slices(
+    dim: Sequence[int], cost: float, sums: Iterable[wp.array | None], device: wp.Device
+) -> tuple[int, int]:
+    """How many slices a launch has, and how many threads there are for them."""
+    sizes = [array.size for array in sums if array is not None]
+    slice_count = int(math.prod(dim) * cost / (_MIN_SUMMED_WORK if sizes else _MIN_WORK))
+    if slice_count <= 1 or device.is_cuda or device.is_capturing:
+        return 1, 1
+    workers = thread_count()
+    if sizes:  # as many for any number of threads
+        return min(dim[0], _SUMMED_SLICES, max(2, _SUMMED_SIZE // max(1, *sizes)), slice_count), workers
+    slice_count = min(dim[0], _SLICES_PER_THREAD * workers, slice_count)
+    if slice_count > workers:
+        slice_count -= slice_count % workers  # as many for each thread
+    return (1, 1) if workers == 1 else (slice_count, workers)
+
+
 def _launch_slices(
     kernel: wp.Kernel,
-    dim: int | Sequence[int],
-    cost: float,
+    dim: Sequence[int],
     arguments: Sequence[Any],
     summed_arguments: dict[int, wp.array],
     gradients: Sequence[wp.array | None] | None,
+    slice_count: int,
+    workers: int,
     device: wp.Device,
 ) -> None:
     """Launch a kernel, or its adjoint where gradients of its arguments are given.
@@ -208,20 +220,9 @@ def _launch_slices(
     Args:
         summed_arguments: Arrays to which all rows add, by argument index; a gradient has the index of its argument.
     """
-    dim, workers = _shape(dim), thread_count()
     arguments = [0, 0 if device.is_cpu else -1, *arguments]
     gradients = None if gradients is None else [None, None, *gradients]
-    maximum, min_work = _SLICES_PER_THREAD * workers, _MIN_WORK
-    if summed_arguments:  # as many for any number of threads
-        min_work = _MIN_SUMMED_WORK
-        maximum = min(
-            _SUMMED_SLICES, max(2, _SUMMED_SIZE // max(1, *(array.size for array in summed_arguments.values())))
-        )
-    is_divisible = device.is_cpu and not device.is_capturing
-    slice_count = min(dim[0], maximum, int(math.prod(dim) * cost / min_work)) if is_divisible else 1
-    if not summed_arguments and slice_count > workers:
-        slice_count -= slice_count % workers  # as many for each thread
-    if slice_count <= 1 or (not summed_arguments and workers == 1):
+    if slice_count == 1:
         warp_internals.bound_kernel(kernel, arguments, device, gradients=gradients)(dim)
         return
     slice_sums = {

@@ -50,7 +50,8 @@ def record_adjoint(adjoint: Callable[[], None], arrays: Iterable[wp.array | None
     tape = current_tape()
     variables = [array for array in arrays if array is not None and array.requires_grad]
     if tape is not None and variables:
-        tape.record_func(adjoint, variables)
+        tape.launches.append(adjoint)  # record_func looks at each array anew
+        tape.gradients.update((array, array.grad) for array in variables)
 
 
 def record_kernel(kernel: wp.Kernel, dim: Sequence[int], arguments: Sequence[Any], device: wp.Device) -> None:
@@ -63,7 +64,7 @@ def record_kernel(kernel: wp.Kernel, dim: Sequence[int], arguments: Sequence[Any
     def play_back() -> None:
         warp_internals.bound_kernel(kernel, arguments, device, gradients=gradients_of(arguments))(dim)
 
-    tape.record_func(play_back, [])
+    tape.launches.append(play_back)
     verify_access(tape, kernel, arguments)
 
 
@@ -86,4 +87,4 @@ def record(function: Callable[[], None]) -> None:
     """Record a function that the tape that is recording, if one is, calls when it plays back to here."""
     tape = current_tape()
     if tape is not None:
-        tape.record_func(function, [])
+        tape.launches.append(function)

@@ -9,6 +9,7 @@ import ctypes
 import functools
 import inspect
 import itertools
+import math
 import os
 import struct
 import threading
@@ -68,7 +69,7 @@ if "inline" not in inspect.signature(wp.func).parameters:  # Warp 1.17, whose co
 
     wp.func = _decide_on_its_own
 
-_types = wp._src.types
+_context, _types = wp._src.context, wp._src.types
 
 BLOCK_DIM = 64  # threads of a block on CUDA: with few a block, some thousand receivers reach all multiprocessors
 
@@ -276,7 +277,7 @@ def _cpu_array(shape: Any, dtype: type) -> tuple[dict[str, Any], bytes, int]:
     """Attributes of a new CPU array but for its memory, its descriptor, and its bytes."""
     check_strides(shape, dtype)
     array = wp.empty(shape, dtype, device="cpu")
-    attributes = dict(vars(array)) | {"deleter": _free}
+    attributes = vars(array) | {"deleter": _spare_memory.give_back}
     return attributes, bytes(array.__ctype__()), array.capacity
 
 
@@ -285,10 +286,6 @@ _spare_memory = SpareMemory(
     lambda block: wp._src.context.runtime.core.wp_free_host(block),
     limit=2**29,
 )
-
-
-def _free(pointer: int, size: int) -> None:
-    _spare_memory.give_back(pointer, size)
 
 
 def check_strides(shape: int | Sequence[int], dtype: type) -> None:
@@ -304,10 +301,17 @@ def check_strides(shape: int | Sequence[int], dtype: type) -> None:
         stride *= length
 
 
-def new_array(shape: int | Sequence[int], dtype: type, device: wp.Device) -> wp.array:
-    """Make an array of uninitialized memory, in a third of the time of ``wp.empty``."""
-    runtime = wp._src.context.runtime
-    if not device.is_cpu or runtime._apic_capture is not None:
+@functools.lru_cache(maxsize=4096)
+def byte_count(shape: tuple[int, ...], dtype: type) -> int:
+    """Bytes of an array, which strides must reach as :func:`check_strides` says."""
+    check_strides(shape, dtype)
+    return math.prod(shape) * wp.types.type_size_in_bytes(dtype)
+
+
+def empty(shape: int | Sequence[int], dtype: type, device: wp.DeviceLike) -> wp.array:
+    """Make an array of uninitialized memory: ``wp.empty``, but in a third of the time."""
+    device = device if isinstance(device, wp.Device) else wp.get_device(device)
+    if not device.is_cpu or _context.runtime._apic_capture is not None:
         check_strides(shape, dtype)
         return wp.empty(shape, dtype, device=device)
     attributes, descriptor, size = _cpu_array(shape if isinstance(shape, int) else tuple(shape), dtype)
@@ -334,14 +338,16 @@ def array_at(pointer: int, shape: Sequence[int], dtype: type, *, owner: Any) -> 
     return array
 
 
-def contiguous_view(array: wp.array, shape: Sequence[int], dtype: type, *, first: int = 0) -> wp.array | None:
+def contiguous_view(
+    array: wp.array, shape: Sequence[int], dtype: type, *, first: int = 0, has_gradient: bool = True
+) -> wp.array | None:
     """View contiguous memory of a CPU array, and of its gradient, from a byte on, in another shape or dtype.
 
     None where Warp is to do it: of arrays on a GPU, and of such that are not contiguous or empty.
     """
-    gradient = array.grad
+    gradient = array._grad if has_gradient else None
     is_whole = array.is_contiguous and array.ptr and (gradient is None or gradient.is_contiguous)
-    if not is_whole or not array.device.is_cpu or wp._src.context.runtime._apic_capture is not None:
+    if not is_whole or not array.device.is_cpu or _context.runtime._apic_capture is not None:
         return None
     view = array_at(array.ptr + first, shape, dtype, owner=array)
     if gradient is not None:

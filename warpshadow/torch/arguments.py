@@ -108,7 +108,7 @@ class Arguments:
         find_capture = None
         if replays is not None:
             reused = [number for number, name in enumerate(self.names) if name.startswith(_CACHED_BY_VALUE)]
-            find_capture = functools.partial(replays.find, tuple(map(_key, inputs)), reused)
+            find_capture = functools.partial(replays.find, lambda: tuple(map(_key, inputs)), reused)
         geometries: list[Geometry[wp.array]] = []
 
         def call(*arrays: wp.array) -> Any:
@@ -153,7 +153,8 @@ def _filled(value: Any, arrays: Sequence[wp.array]) -> Any:
     if isinstance(value, Geometry):
         return value.map(lambda slot: arrays[slot.number])
     if isinstance(value, ImageInputs):
-        return dataclasses.replace(value, **{name: _filled(item, arrays) for name, item in vars(value).items()})
+        parts = {name: _filled(item, arrays) for name, item in vars(value).items() if item is not None}
+        return dataclasses.replace(value, **parts)
     return [_filled(item, arrays) for item in value] if isinstance(value, list) else value
 
 

@@ -25,7 +25,7 @@ from warpshadow.device import cuda_graph
 from warpshadow.device.constants import collected
 from warpshadow.device.memory import require_gradient
 from warpshadow.device.tape import recorded, unrecorded
-from warpshadow.torch.autograd import Playback, TensorCall, array_of, as_array, current_stream, is_capturing
+from warpshadow.torch.autograd import Playback, TensorCall, array_of, as_array, current_stream, is_capturing, tensor_of
 
 _PLAIN_CALLS = 2  # of a kind before it is captured: the first compiles kernels and fills caches, as may the second
 _MAX_FAILURES = 2  # after which calls of a kind stay plain
@@ -44,18 +44,18 @@ class Replays:
         """Copies begin anew."""
         return functools.partial(Replays, is_on=self.is_on), ()
 
-    def find(self, key: Hashable, reused: Collection[int], call: TensorCall) -> Capture | None:
+    def find(self, key_of: Callable[[], Hashable], reused: Collection[int], call: TensorCall) -> Capture | None:
         """Find or make the capture of a call; None if it is to be plain.
 
         Args:
-            key: Arguments of the call but the tensors.
+            key_of: Makes the key of the arguments of the call but the tensors.
             reused: Indices of tensors about which results are cached while they stay the same.
             call: The call.
         """
         capture, self.reason = None, self._why_plain(call.device)
         if not self.reason:
             pairs = zip(call.tensors, call.requires_grad, strict=True)
-            kind_key = str(call.device), key, tuple((tuple(tensor.shape), needs) for tensor, needs in pairs)
+            kind_key = str(call.device), key_of(), tuple((tuple(tensor.shape), needs) for tensor, needs in pairs)
             kind = self._kinds.pop(kind_key, None) or _Kind()
             self._kinds[kind_key] = kind  # the last that was used
             while len(self._kinds) > _MAX_KINDS:
@@ -143,9 +143,7 @@ class Capture:
             self._forward, self._tape = capture.graph, tape
             self._results = results if isinstance(results, tuple) else (results,)
             if tape is not None:
-                self._adjoints = [
-                    torch.zeros_like(wp.to_torch(result, requires_grad=False)) for result in self._results
-                ]
+                self._adjoints = [torch.zeros_like(tensor_of(result)) for result in self._results]
                 sources = [
                     array_of(adjoint, result.dtype)
                     for adjoint, result in zip(self._adjoints, self._results, strict=True)
@@ -176,7 +174,7 @@ class Capture:
         """Replay it forward: the results, and the call for its gradients."""
         self._launch_forward(tensors)
         with current_stream(self._device):
-            results = tuple(wp.to_torch(result, requires_grad=False).clone() for result in self._results)
+            results = tuple(tensor_of(result).clone() for result in self._results)
         return results, functools.partial(self._gradients, [tensor.detach() for tensor in tensors], self._state)
 
     def _launch_forward(self, tensors: Sequence[torch.Tensor]) -> None:
@@ -198,6 +196,5 @@ class Capture:
         with current_stream(self._device):
             wp.capture_launch(self._backward)
             return tuple(
-                wp.to_torch(argument.grad, requires_grad=False).clone() if argument.requires_grad else None
-                for argument in self._arguments
+                tensor_of(argument.grad).clone() if argument.requires_grad else None for argument in self._arguments
             )
