@@ -1,8 +1,8 @@
 """Mirrored bodies: light that metals add to the mean radiance of blockers, where rays say which ones lobes meet.
 
-As bodies and cameras move, what a metal mirrors changes within its outline in a lobe, and the outline moves; most of
-both cancels. Hits know no outlines, so the first alone would make gradients wrong (two balls: 1.6 times too large). So
-hits, and how much of them is seen, are constants: the gradient to geometry and cameras is that of the mean radiance.
+As bodies and cameras move, the mirrored light changes within a metal's outline in a lobe, and the outline moves; most
+of both cancels. Hits know no outlines, so the first alone would make gradients wrong (of two balls 2.6 times too
+large). So hits, and how much of them is seen, are constants: the gradient is that of the mean radiance.
 """
 
 from __future__ import annotations
