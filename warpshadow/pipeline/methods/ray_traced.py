@@ -98,11 +98,12 @@ class RayTraced(Method):
         lit, samples = (_checked_points(receivers.points), receivers.normals), self.emitters.samples
         rays = max(1, (self.visibility.ray_count if self.shares_directions else self._sample_count) // (4 * SAMPLES))
         meshes = [self.merged_scene.casting_mesh(positions[instance]) for instance in range(len(positions))]
+        pairs = zip(samples.spans(), self.emitters.ray_counts(placed_samples, rays), strict=True)
         return [
             trace_transmittances(
-                meshes, *lit, samples, positions, placed_samples, span, rays=rays, progress=self.progress
+                meshes, *lit, samples, positions, placed_samples, span, rays=counts, progress=self.progress
             )
-            for span in samples.spans()
+            for span, counts in pairs
         ]
 
     @functools.cached_property

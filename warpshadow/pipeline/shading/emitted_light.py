@@ -191,7 +191,7 @@ def trace_transmittances(
     placed_samples: PlacedSamples,
     span: EmitterSpan,
     *,
-    rays: int,
+    rays: int | np.ndarray,
     progress: bool = False,
 ) -> wp.array:
     """Trace the transmittance to the samples of an emitter in all instances.
@@ -202,7 +202,7 @@ def trace_transmittances(
         emitters, span: Samples of all emitters, and those of one.
         positions: All vertices, vec3 of shape [geometry, vertex].
         placed_samples: Where the samples are in each geometry.
-        rays: To each sample.
+        rays: To each sample, one number, or ints of shape [sample].
     Returns:
         Float32 of shape [batch, receiver, sample].
     Differentiable: no.

@@ -158,6 +158,27 @@ class SceneEmitters:
             total += light.numpy()[0] @ LUMINANCE
         return total
 
+    def ray_counts(self, placed_samples: PlacedSamples, mean: int) -> list[np.ndarray]:
+        """Rays from each receiver to the samples of each emitter, ints of shape [sample].
+
+        Of emitters whose radiance varies, samples get as many as they have of the light, at least one. In the light of
+        walls of a room under a sky with a sun, edges of shadows so have a tenth of the noise.
+
+        Args:
+            placed_samples: Where the samples are.
+            mean: Rays to each sample of an emitter of one radiance, and on average of those whose radiance varies.
+        """
+        bodies, first = self._merged_scene.scene.bodies, self.samples.first
+        varies = [bool(np.ptp(bodies[body].emission.reshape(-1, 3), axis=0).any()) for body in self.samples.bodies]
+        is_varying = np.repeat(varies, np.diff(first))
+        counts = np.full(len(is_varying), mean)
+        if any(varies):
+            radiance = self.radiance(Materials.of_scene(self._merged_scene)).value(Call(Clock())).numpy()[0]
+            power = (radiance @ LUMINANCE) * np.linalg.norm(placed_samples.areas.numpy()[0], axis=1) * is_varying
+            budget = mean * is_varying.sum() / max(power.sum(), 1e-30)
+            counts[is_varying] = np.maximum(np.rint(budget * power[is_varying]), 1)
+        return np.split(counts, first[1:-1])
+
     def samples_node(self, points: ShadingContext) -> Node:
         """Node of the samples among the bodies around points."""
         return points.cached_of_bodies("emitters", None, lambda: Node("", self._place, points.vertices))

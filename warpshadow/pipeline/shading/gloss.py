@@ -78,8 +78,9 @@ def mix_gloss(
     if mirrors:
         texels = texels if light.is_free else visibility.prefiltered(points, light, with_suns=True)
         look_up = functools.partial(_look_up, method, points, "", light, texels)
-        arguments = points, light, materials, samples, transmittance, blocked, look_up
-        mirrored = method.mirrored_bodies.radiance(mirrors, *arguments)
+        mirrored = method.mirrored_bodies.radiance(
+            mirrors, points, light, materials, samples, transmittance, blocked, look_up
+        )
     lobe_light = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, mirrored, items=item_text)
     suns = visibility.suns(points, light)
     if suns is not None:

@@ -217,7 +217,7 @@ def _trace_transmittance(
     surface: EmitterSurface,
     first_sample: int,
     is_two_sided: int,
-    ray_count: int,
+    ray_counts: wp.array(dtype=wp.int32),
     # out
     transmittance: wp.array2d(dtype=wp.float32),
 ):
@@ -233,6 +233,7 @@ def _trace_transmittance(
         total_weight = float(0.0)
         point_count = surface.point_faces.shape[1]
         first_point = int(float(point_count) * wp.frac(turn + _GOLDEN_SHARE * float(i)))
+        ray_count = ray_counts[i]
         for ray in range(wp.where(is_sending, ray_count, 0)):
             start = (first_point + ray * point_count // ray_count) % point_count
             beam, facing = _beam_to_facing_point(surface, sample, start, point, normal, is_two_sided)
@@ -256,7 +257,7 @@ def trace_transmittance(
     sample_areas: wp.array,
     span: EmitterSpan,
     *,
-    rays: int,
+    rays: int | np.ndarray,
     progress: bool = False,
 ) -> wp.array:
     """Trace the transmittance between receivers and the samples of an emitter, by rays to points of its surface.
@@ -266,26 +267,28 @@ def trace_transmittance(
         points, normals: Receivers [scene units] and their unit normals, vec3 of shape [receiver].
         positions: All vertices [scene units], of one instance, vec3 of shape [vertex].
         sample_points, sample_areas: Of :class:`.samples.PlacedSamples`, of one instance.
-        rays: To each sample, spread over its points; no more than these.
+        span: Samples of the emitter.
+        rays: To each sample, spread over its points, no more than these: one number, or ints of shape [sample].
     Returns:
         Float32 of shape [receiver, sample]; 0 where a sample sends nothing.
     Differentiable: no.
     """
-    device, rays = points.device, min(rays, SURFACE_POINTS)
+    device, ray_counts = points.device, np.minimum(np.broadcast_to(rays, span.size), SURFACE_POINTS)
+    ray_count = max(1, int(ray_counts.sum()))
     transmittance = empty((len(points), span.size), dtype=wp.float32, device=device)
     surface = EmitterSurface()
     surface.positions, surface.faces = positions, samples.faces
     surface.point_faces = constant(samples.surface_points.faces, wp.int32, device)
     surface.point_weights = constant(samples.surface_points.weights, wp.vec3, device)
-    for receivers in progress_slices(len(points), 2**20 // (rays * span.size), progress):
+    for receivers in progress_slices(len(points), 2**20 // ray_count, progress):
         launch(
             _trace_transmittance,
             receivers.stop - receivers.start,
             inputs=[
                 *(mesh_id(mesh), points[receivers], normals[receivers], receivers.start, sample_points, sample_areas),
-                *(surface, span.first, int(span.is_two_sided), rays),
+                *(surface, span.first, int(span.is_two_sided), constant(ray_counts, wp.int32, device)),
             ],
             outputs=[transmittance[receivers]],
-            cost=RAY_COST * rays * span.size,
+            cost=RAY_COST * ray_count,
         )
     return transmittance
