@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -135,7 +135,9 @@ class Problem:
     def _of_images(self) -> Iterator[Target]:
         for number, item in enumerate(self.targets):
             with check.located(f"targets[{number}]"):
-                yield Target(item) if hasattr(item, "shape") or check.is_path(item) else item
+                image: Any = item
+                is_image = isinstance(image, (np.ndarray, torch.Tensor)) or check.is_path(image)
+                yield Target(image) if is_image else image
 
     def _numbered(self) -> Iterator[Free]:
         for number, item in enumerate(self.free):
