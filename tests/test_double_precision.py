@@ -767,9 +767,8 @@ def test_gradients_of_sums_of_lobes_are_exact(quantity, double, device, check):
     sums = double("stages.gloss.reflection").sum_lobes
     weights, light = (wp.vec3d, random(0, 1, 2, 3, 3)), (wp.vec3d, random(1, 2, 2, 3, 3))
     share = wp.float64, random(2, 1, 2, 3)
-    for shape in ((1, 2, 3), (1, 2, 3, 3)):  # of receivers, of samples
-        blocked = wp.vec3d, random(3, *shape)
-        check(lambda *arguments: sums(*arguments)[quantity], weights, light, share, blocked)
+    blocked, mirrored = (wp.vec3d, random(3, 1, 2, 3)), (wp.vec3d, random(4, 1, 2, 3, 3))
+    check(lambda *arguments: sums(*arguments)[quantity], weights, light, share, blocked, mirrored)
 
 
 @pytest.mark.parametrize("quantity", ["radiance", "filters"])
@@ -784,14 +783,16 @@ def test_gradients_of_the_light_of_metals_are_exact(quantity, double, device, ch
     )
     faces = put(np.int32([[0, 1, 2], [1, 3, 2]]), wp.vec3i, device)
 
-    def mix(roughness, directions, filters, albedo, metallic, mean):
+    def mix(roughness, directions, filters, albedo, metallic, mean, share):
         mirrored = module.mirror(hits, faces, roughness, directions, filters)
-        mixed = module.mix_mirrored(hits, faces, albedo, metallic, mirrored.filters, mirrored.directions, mean)
+        light = mirrored.directions, mean, share
+        mixed = module.mix_mirrored(hits, faces, albedo, metallic, mirrored.filters, *light)
         return mixed if quantity == "radiance" else mirrored.filters
 
     scalars = [(wp.float64, 0.5 + 0.2 * np.tanh(random(seed, 1, 4))) for seed in (2, 3)]
     samples = (wp.vec3d, unit(random(4, 1, 2, 3, 3))), (wp.vec3d, 0.2 + np.abs(random(5, 1, 2, 3, 3)))
-    check(mix, scalars[0], *samples, (wp.vec3d, random(6, 1, 4, 3)), scalars[1], (wp.vec3d, random(7, 1, 2, 3)))
+    blockers = (wp.vec3d, random(7, 1, 2, 3)), (wp.float64, random(8, 1, 2, 3))
+    check(mix, scalars[0], *samples, (wp.vec3d, random(6, 1, 4, 3)), scalars[1], *blockers)
 
 
 def test_gradients_of_radiance_of_blockers_are_exact(double, device, check):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from warpshadow.maths.convex import MAX_FACES, find_convex_parts
+from warpshadow.maths.convex import MAX_FACES, find_convex_parts, is_convex
 
 
 def parts_of(mesh):
@@ -219,3 +219,10 @@ def test_faces_that_share_two_edges_are_of_no_part():
     left = [(0, 1, 6), (1, 3, 6), (3, 9, 6), (3, 4, 9), (4, 5, 9)]
     top = [*right, *left, (1, 2, 3), (2, 4, 3), (6, 7, 0), (5, 8, 9)]
     assert find_convex_parts(*roof(ridge, top, 0.05)) is None
+
+
+def test_solids_without_a_dent_are_convex():
+    ball, torus = trimesh.creation.icosphere(3), trimesh.creation.torus(0.4, 0.15)
+    assert is_convex(ball.vertices, ball.faces) and is_convex(ball.vertices, ball.faces[:, ::-1])
+    dented = ball.vertices * (1 - 0.1 * (ball.vertices[:, 1:2] > 0.9))
+    assert not is_convex(dented, ball.faces) and not is_convex(torus.vertices, torus.faces)

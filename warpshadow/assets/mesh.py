@@ -20,7 +20,7 @@ from warpshadow.assets import files, topology
 from warpshadow.assets.color import linear_to_srgb
 from warpshadow.check import AnyPath
 from warpshadow.maths.adjacency import area_normals
-from warpshadow.maths.convex import ConvexPart, find_convex_parts
+from warpshadow.maths.convex import ConvexPart, find_convex_parts, is_convex
 from warpshadow.maths.plane import plane_normal
 
 
@@ -162,6 +162,11 @@ class Mesh:
     def is_flat(self) -> bool:
         """Whether it lies in a plane."""
         return plane_normal(self.positions[self.surface.faces].astype(np.float64)) is not None
+
+    @functools.cached_property
+    def is_convex(self) -> bool:
+        """Whether no part of it sees another: it is flat, or closed around a convex solid."""
+        return self.is_flat or self.surface.is_closed and is_convex(self.positions, self.surface.faces)
 
     @functools.cached_property
     def convex_parts(self) -> list[ConvexPart]:

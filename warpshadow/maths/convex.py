@@ -53,6 +53,21 @@ def is_panel(part: ConvexPart) -> bool:
     return len(part.faces) == 2 and not part.is_seam
 
 
+def is_convex(positions: np.ndarray, faces: np.ndarray) -> bool:
+    """Whether a closed mesh encloses a convex solid: it fills its convex hull, but for a ten-thousandth.
+
+    Args:
+        positions: Vertices, shape [vertex, 3].
+        faces: Triangles that wind alike, shape [face, 3].
+    """
+    from scipy.spatial import ConvexHull
+
+    points = positions[np.unique(faces)].astype(np.float64)
+    corners = positions[faces] - points.mean(axis=0)
+    volume = (area_normals(corners) * corners[:, 0]).sum() / 6
+    return bool(abs(volume) > (1 - _FLATNESS) * ConvexHull(points).volume)
+
+
 def find_convex_parts(
     positions: np.ndarray, faces: np.ndarray, *, flat_panels: bool = False
 ) -> list[ConvexPart] | None:

@@ -66,10 +66,11 @@ def test_nothing_is_traced_towards_open_sky(device):
 
 
 def mixed(device, hits, faces, *arrays):
-    """R of all samples, of a light that is the mirrored direction and its blur."""
-    roughness, directions, filters, albedo, metallic, mean = arrays
+    """M of all samples, of a light that is the mirrored direction and its blur."""
+    roughness, directions, filters, albedo, metallic, mean, through = arrays
     towards = mirrored.mirror(hits, faces, roughness, directions, filters)
-    return mirrored.mix_mirrored(hits, faces, albedo, metallic, towards.filters, towards.directions, mean), towards
+    light = towards.directions, mean, through
+    return mirrored.mix_mirrored(hits, faces, albedo, metallic, towards.filters, *light), towards
 
 
 def inputs_of(device):
@@ -81,6 +82,7 @@ def inputs_of(device):
         (rng.uniform(0.2, 0.9, (1, 8, 3)), wp.vec3),
         (rng.uniform(0.3, 0.9, (1, 8)), wp.float32),
         (rng.uniform(0.2, 0.9, (1, 2, 3)), wp.vec3),
+        (rng.uniform(0.1, 0.9, (1, 2, 3)), wp.float32),
     ]
     return [put(array, dtype, device) for array, dtype in values]
 
@@ -94,7 +96,7 @@ def test_metals_send_the_light_that_they_mirror_in_their_color(device):
     arrays = inputs_of(device)
     radiance, towards = mixed(device, batched(hits), faces, *arrays)
     meets, normals, is_open, expected_towards, _ = expected_hits()
-    roughness, _, filters, albedo, metallic, mean = (array.numpy()[0] for array in arrays)
+    roughness, _, filters, albedo, metallic, mean, through = (array.numpy()[0] for array in arrays)
     weights, corners = hits.barycentrics.numpy()[meets], FACES[hits.face_ids.numpy()[meets]]
     rough, color, share = (
         np.einsum("hc,hc...->h...", weights, values[corners]) for values in (roughness, albedo, metallic)
@@ -106,6 +108,6 @@ def test_metals_send_the_light_that_they_mirror_in_their_color(device):
     of_receivers = np.broadcast_to(mean[:, None], (2, 3, 3))
     seen = np.where(is_open[meets][:, None], expected_towards[meets], of_receivers[meets])
     fresnel = color + (1 - color) * grazing[:, None]
-    expected = of_receivers.copy()
-    expected[meets] += share[:, None] * (fresnel * seen - of_receivers[meets])
+    expected = np.zeros((2, 3, 3))
+    expected[meets] = ((1 - through[meets]) * share)[:, None] * (fresnel * seen - of_receivers[meets])
     np.testing.assert_allclose(radiance.numpy()[0], expected, atol=10 * FLOAT32)

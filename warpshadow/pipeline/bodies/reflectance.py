@@ -158,11 +158,10 @@ class Materials:
         body = self.merged_scene.scene.bodies[number]
         return not np.any(body.albedo if body.texture is None else body.texture)
 
-    @property
-    def may_be_metal(self) -> bool:
-        """Whether a body may be a metal: one is in the scene, or a call says how metallic they are."""
-        is_given = self._inputs["metallic"] is not self._of_scene["metallic"]
-        return is_given or any(np.any(body.metallic) for body in self.merged_scene.scene.bodies if body.is_glossy)
+    def may_be_metal(self, number: int) -> bool:
+        """Whether a body that shines may be a metal: it is one in the scene, or a call says how metallic it is."""
+        is_given = self._inputs["metallic"].value()[number] is not self._of_scene["metallic"].value()[number]
+        return is_given or bool(np.any(self.merged_scene.scene.bodies[number].metallic))
 
     def replaced(self, replacements: Mapping[str, BodyArrays]) -> "Materials":
         """A copy with other arrays of some bodies, by name, checked; nodes of the others are shared.

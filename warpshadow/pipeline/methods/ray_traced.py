@@ -212,7 +212,6 @@ class TracedLobes(LobeVisibility):
 
     sample_count = 64  # each is blocked or not: with 32, reflected edges show as many edges
     sun_sample_count = 16
-    traces_hits = True
 
     def __init__(self, method: RayTraced):
         super().__init__(method.merged_scene, method.light, shares_receivers=method.shares_lobes)

@@ -74,13 +74,13 @@ def mix_gloss(
     starts = field_of(points.receivers_node, "points")
     radiance = _look_up(method, points, "prefiltered light", light, texels, directions, filters, starts)
     transmittance = visibility.transmittance(lobes, directions)
-    if blocked is not None and visibility.traces_hits and materials.may_be_metal:
-        from warpshadow.pipeline.shading.mirrored_bodies import find_mirrored_radiance
-
+    mirrored: Node | None = None
+    if blocked is not None and (mirrors := method.mirrored_bodies.mirrors(materials)):
         texels = texels if light.is_free else visibility.prefiltered(points, light, with_suns=True)
         look_up = functools.partial(_look_up, method, points, "", light, texels)
-        blocked = find_mirrored_radiance(points, materials, samples, transmittance, blocked, look_up)
-    lobe_light = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, items=item_text)
+        arguments = points, light, materials, samples, transmittance, blocked, look_up
+        mirrored = method.mirrored_bodies.radiance(mirrors, *arguments)
+    lobe_light = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, mirrored, items=item_text)
     suns = visibility.suns(points, light)
     if suns is not None:
         sun_transmittance = visibility.sun_transmittance(lobes, suns)

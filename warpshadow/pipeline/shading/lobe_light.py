@@ -41,7 +41,6 @@ class LobeVisibility:
     | :meth:`sun_transmittance` | suns | :meth:`transmittance` in :attr:`sun_sample_count` directions of each |
     | :meth:`blocked_radiance` | light that bounces | refused |
     | :attr:`sample_count`, :attr:`sun_sample_count` | the noise of its shadows | 32; 1 |
-    | :attr:`traces_hits` | metals that lobes meet reflect light once more | no: all blockers have one radiance |
 
     Args:
         merged_scene: The bodies.
@@ -54,8 +53,6 @@ class LobeVisibility:
     16 (roughness 0.35)."""
 
     sun_sample_count = 1  # directions in which each sun is looked for from the lobe of a receiver
-
-    traces_hits = False  # whether rays say which bodies lobes meet
 
     def __init__(self, merged_scene: MergedScene, scene_light: LightInput, *, shares_receivers: bool):
         self._merged_scene, self._scene_light = merged_scene, scene_light

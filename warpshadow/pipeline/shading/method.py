@@ -32,6 +32,7 @@ from warpshadow.stages.shell.shell_rays import check_shell, shell_array
 if TYPE_CHECKING:  # they are imported where a body emits, or shines
     from warpshadow.pipeline.shading.emitters import SceneEmitters
     from warpshadow.pipeline.shading.lobe_light import LobeVisibility
+    from warpshadow.pipeline.shading.mirrored_bodies import MirroredBodies
 
 
 class Method(abc.ABC):
@@ -101,6 +102,13 @@ class Method(abc.ABC):
         from warpshadow.pipeline.shading.emitters import SceneEmitters
 
         return SceneEmitters(self.merged_scene)
+
+    @functools.cached_property
+    def mirrored_bodies(self) -> MirroredBodies:
+        """The metals that lobes meet."""
+        from warpshadow.pipeline.shading.mirrored_bodies import MirroredBodies
+
+        return MirroredBodies(self.merged_scene)
 
     def light_of_emitters(self, points: ShadingContext, materials: Materials) -> Node:
         """Direct light of emitters on points, vec3 of shape [batch, receiver], cached for the last emission."""

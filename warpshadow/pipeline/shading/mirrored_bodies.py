@@ -1,4 +1,9 @@
-"""Mirrored bodies: radiance of the blockers of each sample of lobes, where rays say which metals these meet."""
+"""Mirrored bodies: light that metals add to the mean radiance of blockers, where rays say which ones lobes meet.
+
+As bodies and cameras move, the mirrored light changes within a metal's outline in a lobe, and the outline moves; most
+of both cancels. Hits know no outlines, so the first alone would make gradients wrong (of two balls 2.6 times too
+large). So hits, and how much of them is seen, are constants: the gradient is that of the mean radiance.
+"""
 
 from __future__ import annotations
 
@@ -10,79 +15,122 @@ import warp as wp
 
 from warpshadow.device.batch import instance_of
 from warpshadow.device.constants import constant
+from warpshadow.device.memory import copied
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node, detached, field_of
 from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
+from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.stages.gloss.lobe_hits import HIT_TYPES, LobeHits, trace_hits
 from warpshadow.stages.gloss.mirrored import mirror, mix_mirrored
 from warpshadow.stages.receivers.find import Receivers
 
 
-def find_mirrored_radiance(
-    points: ShadingContext,
-    materials: Materials,
-    samples: Node,
-    transmittance: Node,
-    mean_radiance: Node,
-    look_up: Callable[[Node, Node, Node], Node],
-) -> Node:
-    """Node of the radiance of blockers, vec3 of shape [batch, receiver, sample].
+class MirroredBodies:
+    """The metals that lobes meet, in a mesh of all bodies that is made once and refitted to each geometry.
 
     Args:
-        points: The receivers.
-        materials: Of the bodies.
-        samples: Node of their lobes' samples.
-        transmittance: Node of the samples' transmittance, 0 or 1.
-        mean_radiance: Node of the mean radiance of each receiver's blockers.
-        look_up: Makes the node of light without shadows, of nodes of directions, filters, and where these rays start.
+        merged_scene: The bodies.
     """
-    merged_scene, faces = points.merged_scene, points.merged_scene.faces
-    directions = field_of(samples, "directions")
-    find = functools.partial(_find_hits, merged_scene, _mirror_faces(merged_scene, materials))
-    traced = points.vertices, points.normals, points.receivers_node, directions, transmittance
-    items = functools.partial(receiver_text, points.weak)
-    hits = Node("hits of lobes", find, *(detached(source) for source in traced), items=items)
-    roughness, albedo, metallic = (materials.of_vertices(name) for name in ("roughness", "albedo", "metallic"))
-    mirrored = Node("", mirror, hits, faces, roughness, directions, field_of(samples, "filters"))
-    filters = field_of(mirrored, "filters")
-    light = look_up(field_of(mirrored, "directions"), filters, field_of(hits, "points"))
-    return Node("light of metals", mix_mirrored, hits, faces, albedo, metallic, filters, light, mean_radiance)
 
+    def __init__(self, merged_scene: MergedScene):
+        self._merged_scene = merged_scene
+        self._mesh: wp.Mesh | None = None
 
-def _mirror_faces(merged_scene: MergedScene, materials: Materials) -> wp.array:
-    """1 for faces of bodies that shine and have no textures, whose color and roughness vertices have."""
-    is_mirror = merged_scene.is_glossy.copy()
-    for textures in materials.textures_of.values():
-        is_mirror &= np.array([size is None for size in textures.sizes])
-    return constant(is_mirror[merged_scene.body_of_face].astype(np.int32), wp.int32, merged_scene.device)
-
-
-def _find_hits(
-    merged_scene: MergedScene,
-    is_mirror: wp.array,
-    positions: wp.array,
-    vertex_normals: wp.array,
-    receivers: Receivers,
-    directions: wp.array,
-    transmittance: wp.array,
-) -> LobeHits:
-    """Trace all instances: arrays of shape [batch, receiver, sample]."""
-    hits = [
-        trace_hits(
-            merged_scene.mesh(instance_of(positions, instance)),
-            is_mirror,
-            merged_scene.faces,
-            instance_of(vertex_normals, instance),
-            instance_of(receivers.points, instance),
-            instance_of(receivers.normals, instance),
-            instance_of(directions, instance),
-            instance_of(transmittance, instance),
+    def mirrors(self, materials: Materials) -> tuple[int, ...]:
+        """Bodies that lobes may meet as metals, without textures: others shine, too, or they are not convex."""
+        bodies, is_glossy = self._merged_scene.scene.bodies, self._merged_scene.is_glossy
+        sizes_of = [textures.sizes for textures in materials.textures_of.values()]
+        is_untextured = np.all([[size is None for size in sizes] for sizes in sizes_of], axis=0)
+        return tuple(
+            number
+            for number in np.flatnonzero(is_glossy & is_untextured).tolist()
+            if materials.may_be_metal(number) and (is_glossy.sum() > 1 or not bodies[number].mesh.is_convex)
         )
-        for instance in range(len(directions) if directions.size else 0)
-    ]
-    joined = [wp.empty(directions.shape, dtype=dtype, device=directions.device) for dtype in HIT_TYPES]
-    for array, parts in zip(joined, zip(*hits, strict=True), strict=False):
-        for instance, part in enumerate(parts):
-            wp.copy(array[instance], part)
-    return LobeHits(*joined)
+
+    def radiance(
+        self,
+        mirrors: tuple[int, ...],
+        points: ShadingContext,
+        light: LightInput,
+        materials: Materials,
+        samples: Node,
+        transmittance: Node,
+        mean_radiance: Node,
+        look_up: Callable[[Node, Node, Node], Node],
+    ) -> Node:
+        """Node of the radiance that metals add to the mean of blockers, vec3 of shape [batch, receiver, sample].
+
+        Args:
+            mirrors: The metals, of :meth:`mirrors`.
+            points: The receivers.
+            light: Known or free.
+            materials: Of the bodies.
+            samples: Node of the samples of lobes, cached for a roughness.
+            transmittance: Node of the samples' transmittance.
+            mean_radiance: Node of the mean radiance of each receiver's blockers.
+            look_up: Makes the node of light without shadows, of nodes of directions, filters, and where these rays
+                start.
+        """
+        faces, filters = self._merged_scene.faces, field_of(samples, "filters")
+        directions, transmittance = (
+            Node("", _constant, node) for node in (field_of(samples, "directions"), transmittance)
+        )
+
+        def trace() -> Node:
+            find = functools.partial(self._find_hits, mirrors)
+            traced = points.vertices, points.normals, points.receivers_node, directions, transmittance
+            items = functools.partial(receiver_text, points.weak)
+            return Node("hits of lobes", find, *(detached(source) for source in traced), items=items)
+
+        hits = points.cached("hits", (samples, light.visibility_key, mirrors), trace)
+        roughness, albedo, metallic = (materials.of_vertices(name) for name in ("roughness", "albedo", "metallic"))
+        mirrored = Node("", mirror, hits, faces, roughness, directions, filters)
+        filters = field_of(mirrored, "filters")
+        mirrored_light = look_up(field_of(mirrored, "directions"), filters, field_of(hits, "points"))
+        inputs = faces, albedo, metallic, filters, mirrored_light, mean_radiance, transmittance
+        return Node("light of metals", mix_mirrored, hits, *inputs)
+
+    def _find_hits(
+        self,
+        mirrors: tuple[int, ...],
+        positions: wp.array,
+        vertex_normals: wp.array,
+        receivers: Receivers,
+        directions: wp.array,
+        transmittance: wp.array,
+    ) -> LobeHits:
+        """Trace all instances: arrays of shape [batch, receiver, sample]."""
+        merged_scene = self._merged_scene
+        is_mirror = constant(np.isin(merged_scene.body_of_face, mirrors).astype(np.int32), wp.int32, positions.device)
+        hits = [
+            trace_hits(
+                self._refitted(instance_of(positions, instance)),
+                is_mirror,
+                merged_scene.faces,
+                instance_of(vertex_normals, instance),
+                instance_of(receivers.points, instance),
+                instance_of(receivers.normals, instance),
+                instance_of(directions, instance),
+                instance_of(transmittance, instance),
+            )
+            for instance in range(len(directions) if directions.size else 0)
+        ]
+        joined = [wp.empty(directions.shape, dtype=dtype, device=directions.device) for dtype in HIT_TYPES]
+        for array, parts in zip(joined, zip(*hits, strict=True), strict=False):
+            for instance, part in enumerate(parts):
+                wp.copy(array[instance], part)
+        return LobeHits(*joined)
+
+    def _refitted(self, positions: wp.array) -> wp.Mesh:
+        """The mesh, of vertices of shape [vertex]; until the next is asked for."""
+        if self._mesh is None:
+            self._mesh = self._merged_scene.mesh(positions)
+        wp.copy(self._mesh.points, positions)
+        self._mesh.refit()
+        return self._mesh
+
+
+def _constant(array: wp.array) -> wp.array:
+    """The array without its gradient."""
+    return copied(array) if array.requires_grad else array

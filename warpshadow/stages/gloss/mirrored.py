@@ -1,9 +1,9 @@
 """Mirrored bodies: a metal that a lobe meets reflects light once more, from where its own normal mirrors.
 
-A sample l of a lobe meets a body at a point with normal n, which mirrors l' = l − 2 (n·l) n. In place of the mean
-radiance R̄ of the receiver's blockers the point sends
+A sample l of a lobe, of transmittance T, meets a body at a point with normal n, which mirrors l' = l − 2 (n·l) n. To
+the mean radiance R̄ of the receiver's blockers the point adds
 
-    R = R̄ + m (F (T' L + (1 − T') R̄) − R̄),   F = a + (1 − a) (1 − |n·l|)⁵,
+    M = (1 − T) m (F (T' L + (1 − T') R̄) − R̄),   F = a + (1 − a) (1 − |n·l|)⁵,
 
 m how metallic it is, a its albedo, T' whether a ray along l' meets no body, and L light without shadows from l',
 blurred by σ'² = σ² + 2 α²: σ is the blur of the sample (:mod:`.lobes`), √2 α that of a whole lobe, seen from above.
@@ -113,26 +113,28 @@ def _mix_mirrored(
     filters: wp.array3d(dtype=wp.vec3),
     light: wp.array3d(dtype=wp.vec3),
     mean_radiance: wp.array2d(dtype=wp.vec3),
+    transmittance: wp.array3d(dtype=wp.float32),
     # out
     radiance: wp.array3d(dtype=wp.vec3),
 ):
     """A thread owns a sample."""
     row, sample = wp.tid()
     batch, receiver = split_row(first_row + row, radiance.shape[1])
-    mean = mean_radiance[instance_in(batch, mean_radiance.shape[0]), receiver]
     hit_batch = instance_in(batch, face_ids.shape[0])
     face = face_ids[hit_batch, receiver, sample]
-    result = mean
+    result = wp.vec3(0.0)
     if face >= 0:
         weights = barycentrics[hit_batch, receiver, sample]
         color = interpolate_at(albedo[instance_in(batch, albedo.shape[0])], faces[face], weights)
         share = interpolate_at(metallic[instance_in(batch, metallic.shape[0])], faces[face], weights)
+        share *= 1.0 - transmittance[instance_in(batch, transmittance.shape[0]), receiver, sample]
+        mean = mean_radiance[instance_in(batch, mean_radiance.shape[0]), receiver]
         grazing = filters[instance_in(batch, filters.shape[0]), receiver, sample][0]
         seen = mean
         if is_open[hit_batch, receiver, sample] > 0.5:
             seen = light[instance_in(batch, light.shape[0]), receiver, sample]
         fresnel = color + grazing * (wp.vec3(1.0) - color)
-        result = mean + share * (wp.cw_mul(fresnel, seen) - mean)
+        result = share * (wp.cw_mul(fresnel, seen) - mean)
     radiance[batch, receiver, sample] = result
 
 
@@ -144,8 +146,9 @@ def mix_mirrored(
     filters: wp.array,
     light: wp.array,
     mean_radiance: wp.array,
+    transmittance: wp.array,
 ) -> wp.array:
-    """Mix the radiance R of the blockers of each sample.
+    """Mix the radiance M that metals add to the mean radiance of blockers in each sample.
 
     Args:
         hits, faces: As of :func:`mirror`.
@@ -153,6 +156,7 @@ def mix_mirrored(
         filters: Of :func:`mirror`.
         light: L, vec3 of shape [batch, receiver, sample].
         mean_radiance: R̄, of :func:`.reflection.find_blocked_radiance`, vec3 of shape [batch, receiver].
+        transmittance: T, float32 of shape [batch, receiver, sample].
             Any batch may be 1 and then serves every instance.
 
     Returns:
@@ -161,6 +165,7 @@ def mix_mirrored(
     Differentiable: all but hits.
     """
     values = {"albedo": albedo, "metallic": metallic, "filters": filters, "light": light, "blocked": mean_radiance}
+    values["transmittance"] = transmittance
     shape = common_batch({"hits": hits.face_ids, **values}), *light.shape[1:]
     radiance = wp.empty(shape, dtype=wp.vec3, device=light.device)
     launch(
@@ -168,7 +173,11 @@ def mix_mirrored(
         (shape[0] * shape[1], shape[2]),
         inputs=[hits.face_ids, hits.barycentrics, hits.is_open, faces, *values.values()],
         outputs=[radiance],
-        shared=[albedo, metallic, *(array for array in (filters, light, mean_radiance) if len(array) < shape[0])],
+        shared=[
+            albedo,
+            metallic,
+            *(array for array in (filters, light, mean_radiance, transmittance) if len(array) < shape[0]),
+        ],
         cost=_COST * shape[2],
     )
     return radiance

@@ -1,15 +1,14 @@
 """Reflection: the light of a lobe and diffuse light, as glTF mixes them for metals and for all else.
 
-With G = Σ w (T L + (1 − T) R) and G' = Σ w' (T L + (1 − T) R) over the samples of a lobe, T their transmittance and R
-the radiance of their blockers, diffuse light E, metallic m, specular s and F₀ = 0.04, a surface of albedo a reflects
-a A + C:
+With G = Σ w (T L + (1 − T) R + M) and G' = Σ w' (T L + (1 − T) R + M) over the samples of a lobe, T their
+transmittance, R the mean radiance of blockers and M the radiance that metals add to it (:mod:`.mirrored`), diffuse
+light E, metallic m, specular s and F₀ = 0.04, a surface of albedo a reflects a A + C:
 
     A = (1 − m) (E − s (F₀ E + (1 − F₀) E')) + m (G − G'),
     C = (1 − m) s (F₀ G + (1 − F₀) G') + m G'.
 
-R is the same in all directions that are blocked, but where rays meet metals (:mod:`.mirrored`): their mean by the
-cosine, which bounced light tells. In stills it is a
-ratio of two sums over the same rays, of which most noise cancels.
+R is the same in all directions that are blocked: their mean by the cosine, which bounced light tells. In stills it is
+a ratio of two sums over the same rays, of which most noise cancels.
 E' is diffuse light times (1 − v·h)⁵: of even light it is E e(μ), which is taken for all light.
 """
 
@@ -23,7 +22,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty, reshaped
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 
 DIELECTRIC_F0 = 0.04  # f₀ of all that is not metal: an index of refraction of 1.5
@@ -44,7 +43,8 @@ def _sum_lobes(
     filters: wp.array3d(dtype=wp.vec3),
     light: wp.array3d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
-    blocked_light: wp.array3d(dtype=wp.vec3),
+    blocked_light: wp.array2d(dtype=wp.vec3),
+    mirrored_light: wp.array3d(dtype=wp.vec3),
     # out
     straight: wp.array2d(dtype=wp.vec3),
     grazing: wp.array2d(dtype=wp.vec3),
@@ -55,6 +55,7 @@ def _sum_lobes(
     light_batch = instance_in(batch, light.shape[0])
     transmittance_batch = instance_in(batch, transmittance.shape[0])
     blocked_batch = instance_in(batch, blocked_light.shape[0])
+    mirrored_batch = instance_in(batch, mirrored_light.shape[0])
     straight_sum = wp.vec3()
     grazing_sum = wp.vec3()
     for i in range(filters.shape[2]):
@@ -62,8 +63,9 @@ def _sum_lobes(
         share = transmittance[transmittance_batch, receiver, i]
         radiance = share * light[light_batch, receiver, i]
         if blocked_light:
-            blocked_sample = wp.min(i, blocked_light.shape[2] - 1)
-            radiance += (1.0 - share) * blocked_light[blocked_batch, receiver, blocked_sample]
+            radiance += (1.0 - share) * blocked_light[blocked_batch, receiver]
+        if mirrored_light:
+            radiance += mirrored_light[mirrored_batch, receiver, i]
         straight_sum += weight[0] * radiance
         grazing_sum += weight[1] * radiance
     straight[batch, receiver] = straight_sum
@@ -78,7 +80,11 @@ class LobeLight(NamedTuple):
 
 
 def sum_lobes(
-    filters: wp.array, light: wp.array, transmittance: wp.array, blocked_light: wp.array | None = None
+    filters: wp.array,
+    light: wp.array,
+    transmittance: wp.array,
+    blocked_light: wp.array | None = None,
+    mirrored_light: wp.array | None = None,
 ) -> LobeLight:
     """Sum the light of lobes.
 
@@ -86,20 +92,20 @@ def sum_lobes(
         filters: Of :func:`.lobes.sample_lobes`, vec3 of shape [batch, receiver, sample].
         light: Radiance from the samples, vec3 of shape [batch, receiver, sample].
         transmittance: Float32 of shape [batch, receiver, sample].
-        blocked_light: R, of :func:`find_blocked_radiance`, vec3 of shape [batch, receiver], or of each sample, of
-            :func:`.mirrored.mix_mirrored`, [batch, receiver, sample]; None where light does not bounce.
+        blocked_light: R, of :func:`find_blocked_radiance`, vec3 of shape [batch, receiver]; None where light does not
+            bounce.
+        mirrored_light: M, of :func:`.mirrored.mix_mirrored`, vec3 of shape [batch, receiver, sample]; None for none.
 
     Differentiable: all.
     """
-    if blocked_light is not None and blocked_light.ndim == 2:
-        blocked_light = reshaped(blocked_light, (*blocked_light.shape, 1))
-    arrays = {"filters": filters, "light": light, "transmittance": transmittance, "blocked_light": blocked_light}
+    arrays = {"filters": filters, "light": light, "transmittance": transmittance}
+    arrays |= {"blocked_light": blocked_light, "mirrored_light": mirrored_light}
     count = common_batch(arrays)
     sums = [wp.empty((count, filters.shape[1]), dtype=wp.vec3, device=filters.device) for _ in range(2)]
     launch(
         _sum_lobes,
         count * filters.shape[1],
-        inputs=[filters, light, transmittance, blocked_light],
+        inputs=[*arrays.values()],
         outputs=sums,
         shared=[array for array in arrays.values() if array is not None and len(array) < count],
         cost=_COST * filters.shape[2],
