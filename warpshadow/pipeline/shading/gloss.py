@@ -74,8 +74,8 @@ def mix_gloss(
     starts = field_of(points.receivers_node, "points")
     radiance = _look_up(method, points, "prefiltered light", light, texels, directions, filters, starts)
     transmittance = visibility.transmittance(lobes, directions)
-    mirrors, mirrored = () if blocked is None else method.mirrored_bodies.mirrors(materials), None
-    if mirrors:
+    mirrored: Node | None = None
+    if blocked is not None and (mirrors := method.mirrored_bodies.mirrors(materials)):
         texels = texels if light.is_free else visibility.prefiltered(points, light, with_suns=True)
         look_up = functools.partial(_look_up, method, points, "", light, texels)
         mirrored = method.mirrored_bodies.radiance(
