@@ -286,7 +286,7 @@ class Scene:
         """
         if self.visibility.directions is not None:
             return self.visibility.directions
-        if self.bounces and has_narrow_spot(self):
+        if self.bounces and has_narrow_spot(self.bodies):
             return DIRECTIONS_OF_SPOTS
         roughness = [body.roughness.min() for body in self.bodies if body.roughness is not None]
         return DIRECTIONS_OF_GLOSS if min(roughness, default=1.0) < NARROW_ROUGHNESS else DIRECTIONS

@@ -168,8 +168,8 @@ class SceneEmitters:
             placed_samples: Where the samples are.
             mean: Rays to each sample of an emitter of one radiance, and on average of those whose radiance varies.
         """
-        bodies, first = self._merged_scene.scene.bodies, self.samples.first
-        varies = [bool(np.ptp(bodies[body].emission.reshape(-1, 3), axis=0).any()) for body in self.samples.bodies]
+        first, emissions = self.samples.first, [body.emission for body in self._merged_scene.scene.bodies]
+        varies = [bool(np.ptp(item.reshape(-1, 3), axis=0).any()) for item in emissions if item is not None]
         is_varying = np.repeat(varies, np.diff(first))
         counts = np.full(len(is_varying), mean)
         if any(varies):
