@@ -111,7 +111,6 @@ def test_gradients_of_light_are_those_of_the_twin(names, two_sided, coverage, de
     if coverage == "texels":
         monkeypatch.setattr(plane_blockers, "MAX_EDGES", 5)
     setting = Setting(device, names=names, two_sided=two_sided)
-    setting.transmittance[..., ::2] = 0  # which spares the twin
     variables = setting.arrays()
     points, normals, transmittance, vertices, radiosity = variables
     with recorded() as tape:
@@ -177,7 +176,6 @@ def test_light_of_flats_is_that_of_the_part_that_bodies_before_them_leave_open(n
     moments -= (moments * DIRECTIONS).sum(axis=-1, keepdims=True) * DIRECTIONS
     moments *= 0.4 * (shares * (1 - shares))[..., None]
     setting.coverages = np.concatenate([shares[..., None], moments], axis=-1)
-    setting.transmittance[..., ::2] = 0  # which spares the twin
     points, normals, transmittance, vertices, radiosity = variables = setting.arrays()
     coverages = wp.array(setting.coverages[None], dtype=wp.vec4, device=device, requires_grad=True)
     with recorded() as tape:
