@@ -311,10 +311,10 @@ def find_receivers(
     if len(triangles):
         wp.copy(receiver_faces[count:], from_numpy(receiver_count + triangles, dtype=wp.vec3i, device=device))
     vertices = receiver_of_vertex if vertices is None else vertices
-    arguments = positions, normals, faces, vertices, sample_fragments
+    surfaces = positions, normals, faces, vertices, sample_fragments
     if bodies is None or sample_fragments is None or not sample_fragments.face_ids.size:
         footprint_inputs = None
-    points, point_normals, footprints = _gather_receiver_points(batch_count, *arguments, footprint_inputs, rises=rises)
+    points, point_normals, footprints = _gather_receiver_points(batch_count, *surfaces, footprint_inputs, rises=rises)
     receivers = Receivers(
         points,
         point_normals,
