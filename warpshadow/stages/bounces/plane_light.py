@@ -112,6 +112,8 @@ def _light_receivers_adjoint(
     """A thread owns a receiver."""
     receiver = prepare_receiver(first_row + wp.tid(), worker, inputs, sides, edges)
     batch, index = receiver.batch, receiver.index
+    if adj_addend:
+        adj_addend[batch, index] = adj_addend[batch, index] + adj_light[batch, index]
     hits_of_cell, adj_hits_of_cell = hits[receiver.slot], adj_hits[receiver.slot]
     texel_batch = instance_in(batch, texels.shape[0])
     texel_radiosity = texels[texel_batch]
@@ -163,8 +165,6 @@ def _light_receivers_adjoint(
                     adj_coverages[batch, index, q] = adj_coverages[batch, index, q] + adj_before
     if adj_normals:
         adj_normals[batch, index] = adj_normals[batch, index] + adj_normal
-    if adj_addend:
-        adj_addend[batch, index] = adj_addend[batch, index] + adj_light[batch, index]
     prepare_receiver_adjoint(receiver, inputs, adj_points, adj_front_weights, adj_frames)
 
 
