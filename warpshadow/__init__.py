@@ -59,7 +59,7 @@ _MODULES = {
 
 _SOLID = "Body(trimesh.creation.{}(…)).creased(), or Body(path) of a file"
 
-_ELSEWHERE = {
+_NAME_REMEDIES = {
     "fit": "warpshadow.inverse.fit",
     "TorchRenderer": "warpshadow.torch.TorchRenderer",
     "MixedRenderer": "warpshadow.torch.MixedRenderer",
@@ -144,7 +144,7 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> object:
     if name not in _MODULES:
-        remedy = _ELSEWHERE.get(name)
+        remedy = _NAME_REMEDIES.get(name)
         hint = f" (write {remedy})" if remedy else _check.suggestion(name, __all__)
         raise AttributeError(f"module 'warpshadow' has no attribute {name!r}{hint}")
     with _one_call:  # kernels must not be made while another thread loads some

@@ -115,7 +115,9 @@ def stages(device: str) -> tuple[str, dict[str, Callable[[], object]]]:
     def draw_smoothly(matrices: wp.array = clip_matrices) -> wp.array:
         clip = to_clip(renderer.geometry().positions, matrices)
         fragments = rasterize(clip, faces, scene.camera.width, scene.camera.height)
-        found = find_silhouettes(fragments, faces, renderer.merged_scene.edges, clip, renderer.merged_scene.face_bodies)
+        found = find_silhouettes(
+            fragments, faces, renderer.merged_scene.face_neighbors, clip, renderer.merged_scene.face_bodies
+        )
         return smooth_silhouettes(interpolate(fragments, faces, colors), found, clip)
 
     def draw_and_back() -> None:

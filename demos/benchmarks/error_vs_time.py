@@ -511,7 +511,7 @@ class Rays:
         self.scene = scene
         renderer = ws.Renderer(with_visibility(scene))
         self.geometry = renderer.geometry()
-        self.mesh = renderer.merged_scene.casting_mesh(self.geometry.positions[0])
+        self.mesh = renderer.merged_scene.blocker_mesh(self.geometry.positions[0])
         samples = sample_map(scene.light.radiance, count)
         self.directions, self.radiance = samples.directions[0], samples.radiance[0]
 

@@ -83,19 +83,19 @@ def fit_by_mitsuba(case: Case, iterations: int | None = None) -> tuple[ws.Scene,
     problem, free, method = case.problem, *_method(case)
     count = min(method.stage.iterations, iterations or method.stage.iterations)
     stage = inverse.Stage(count, method.stage.learning_rate)
-    setting = problem.setting(torch.device("cpu"))
-    tracer = RayTracer(setting.scene, method.integrator)
-    targets, weights = stack_targets(problem.targets, 1.0, setting.device)
-    values = {key: tensor.requires_grad_() for key, tensor in free.start(setting).items()}
+    context = problem.context(torch.device("cpu"))
+    tracer = RayTracer(context.scene, method.integrator)
+    targets, weights = stack_targets(problem.targets, 1.0, context.device)
+    values = {key: tensor.requires_grad_() for key, tensor in free.start(context).items()}
     optimizer = inverse.short_adam(list(values.values()), lr=stage.learning_rate)
     durations = []
     for iteration in range(count):
         start = time.perf_counter()
         optimizer.param_groups[0]["lr"] = stage.rate(iteration)
         optimizer.zero_grad()
-        image = tracer.image(placed(free, values, setting), seed=iteration)
-        loss = problem.loss(image[None], targets[..., :3], weights, setting.unit)  # projective sampling has no coverage
-        energy = free.energy(values, setting)
+        image = tracer.image(placed(free, values, context), seed=iteration)
+        loss = problem.loss(image[None], targets[..., :3], weights, context.unit)  # projective sampling has no coverage
+        energy = free.energy(values, context)
         loss = loss if energy is None else loss + energy
         loss.backward()
         if not all(torch.isfinite(tensor).all() for tensor in (loss, *(value.grad for value in values.values()))):
@@ -105,7 +105,7 @@ def fit_by_mitsuba(case: Case, iterations: int | None = None) -> tuple[ws.Scene,
             free.project(values)
         durations.append(time.perf_counter() - start)
     found = {key: tensor.detach() for key, tensor in values.items()}
-    return problem.found({free.name: found}, setting).scene, statistics.median(durations), count, "finished"
+    return problem.fitted_scene({free.name: found}, context).scene, statistics.median(durations), count, "finished"
 
 
 def _method(case: Case) -> tuple[inverse.Free, Method]:
@@ -122,28 +122,28 @@ def _method(case: Case) -> tuple[inverse.Free, Method]:
 # ------------------------------------------------------------------------------------------------ what is free
 
 
-def placed(free: inverse.Free, values: Tensors, setting: Any) -> Tensors:
+def placed(free: inverse.Free, values: Tensors, context: Any) -> Tensors:
     """What a free parameter sets in Mitsuba's scene, by the names there. Differentiable: values."""
     if isinstance(free, inverse.Texture):
         return {f"body{free.body}.bsdf.brdf_0.reflectance.data": values["texels"]}
     if isinstance(free, inverse.Light):
         functions = free.basis.functions(map_directions(LIGHT_HEIGHT).reshape(-1, 3))
-        radiance = setting.tensor(functions) @ free.coefficients(values, setting)
+        radiance = context.tensor(functions) @ free.coefficients(values, context)
         return {"light.data": radiance.reshape(LIGHT_HEIGHT, -1, 3)}
-    points = _moved(free, values, setting)
-    normals = vertex_normals(points, setting.scene.bodies[free.body].mesh.faces)
+    points = _moved(free, values, context)
+    normals = vertex_normals(points, context.scene.bodies[free.body].mesh.faces)
     return {f"body{free.body}.vertex_positions": points, f"body{free.body}.vertex_normals": normals}
 
 
-def _moved(free: inverse.Pose | inverse.Deformation, values: Tensors, setting: Any) -> torch.Tensor:
+def _moved(free: inverse.Pose | inverse.Deformation, values: Tensors, context: Any) -> torch.Tensor:
     """Vertices in world space, [vertex, 3]. Differentiable: values."""
-    body = setting.scene.bodies[free.body]
+    body = context.scene.bodies[free.body]
     if isinstance(free, inverse.Pose):
-        points = setting.tensor(body.mesh.positions)
-        rotation, translation, scale = free._posed(values, setting)
+        points = context.tensor(body.mesh.positions)
+        rotation, translation, scale = free._posed(values, context)
     else:
-        points = free._deformed(values, setting)[0][0]
-        rotation, translation = setting.tensor(body.rotation_matrix()), setting.tensor(body.translation)
+        points = free._deformed(values, context)[0][0]
+        rotation, translation = context.tensor(body.rotation_matrix()), context.tensor(body.translation)
         scale = body.scale
     return scale * points @ rotation.T + translation
 

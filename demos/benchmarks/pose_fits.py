@@ -123,7 +123,7 @@ def staged(scene: ws.Scene, target: np.ndarray) -> list[Moment]:
     """The ready-made stages."""
     watch = Stopwatch()
     problem = inverse.Problem(scene, inverse.Target(target), inverse.Pose(0))
-    setting = problem.setting(torch.device("cpu"))
+    context = problem.context(torch.device("cpu"))
 
     def make(tensors: list[torch.Tensor], lr: float) -> torch.optim.Optimizer:
         optimizer = inverse.default_optimizer(tensors, lr=lr)
@@ -133,7 +133,7 @@ def staged(scene: ws.Scene, target: np.ndarray) -> list[Moment]:
             values = {
                 "pose[0]": dict(zip(("turn", "shift"), (tensor.detach().clone() for tensor in tensors), strict=True))
             }
-            watch.note(lambda: problem.found(values, setting).scene.bodies[0])
+            watch.note(lambda: problem.fitted_scene(values, context).scene.bodies[0])
             return step(closure)
 
         optimizer.step = watched

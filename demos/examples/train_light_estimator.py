@@ -49,7 +49,7 @@ RENDERERS = {"directional": ws.Visibility(method="directional"), "none": ws.Visi
 RAY_TRACED = ws.Visibility(method="ray-traced", samples=256)
 LABELS = {"directional": "with shadows", "none": "without"}
 EVEN_LIGHT = np.eye(ORDER**2, 1) * np.full(3, math.sqrt(4 * math.pi))  # radiance 1 from everywhere
-MIRROR = torch.from_numpy(sh.rotation_matrix(ORDER, np.diag([-1.0, 1.0, 1.0])))  # of light: left is right
+MIRROR = torch.from_numpy(sh.harmonic_rotation(ORDER, np.diag([-1.0, 1.0, 1.0])))  # of light: left is right
 PICTURED = 3
 
 
@@ -114,7 +114,7 @@ def prepare(number: int, scene: ws.Scene, device: torch.device, image: np.ndarra
     reflectance = ws.render(even, device=str(device))[..., :3]
     shading = np.where(reflectance > 0, image[..., :3] / np.maximum(reflectance, 1e-3), 0)
     right, up = scene.camera.rotation[0], np.array([0.0, 1.0, 0.0])
-    to_world = sh.rotation_matrix(ORDER, np.stack([right, up, np.cross(right, up)], axis=1))
+    to_world = sh.harmonic_rotation(ORDER, np.stack([right, up, np.cross(right, up)], axis=1))
     arrays = (image, np.concatenate([shading, image[..., 3:]], axis=-1), to_world.astype(np.float32))
     return Lesson(number, scene, *(torch.from_numpy(array).to(device) for array in arrays))
 

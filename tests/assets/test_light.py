@@ -345,7 +345,7 @@ def test_light_depends_on_what_pixels_cover_and_not_on_their_number(height):
 def test_harmonics_of_a_turned_map_are_turned_harmonics(height, degrees):
     environment = random_map(height, 6)
     rotation = np.stack([turned_y(axis, degrees) for axis in np.eye(3)], axis=1)
-    expected = sh.rotation_matrix(6, rotation) @ environment.sh(6)
+    expected = sh.harmonic_rotation(6, rotation) @ environment.sh(6)
     np.testing.assert_allclose(environment.rotated(degrees).sh(6), expected, atol=1e-6)
 
 

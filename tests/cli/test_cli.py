@@ -20,7 +20,7 @@ import warpshadow as ws
 from warpshadow.assets.image import exr_bytes
 from warpshadow.cli import app
 from warpshadow.maths import sh
-from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
+from warpshadow.pipeline.receivers.choice_of_receivers import for_still
 from warpshadow.scene.visibility import METHODS
 
 PROGRAM = [sys.executable, "-c", "from warpshadow.cli import app; app(prog_name='warpshadow')"]
@@ -867,7 +867,7 @@ def test_warmup_renders_as_stills_and_renderers_do(monkeypatch):
 
     monkeypatch.setattr("warpshadow.pipeline.renderer.SceneRenderer", Recorder)
     assert run("warmup").exit_code == 0
-    still = for_picture(ws.Scene([ws.Body(ws.icosphere(1.0, 0))], np.ones((4, 3)))).visibility
+    still = for_still(ws.Scene([ws.Body(ws.icosphere(1.0, 0))], np.ones((4, 3)))).visibility
     assert {visibility.method for visibility in rendered} == {*METHODS}
     assert (still.method, still.sampling) in [(visibility.method, visibility.sampling) for visibility in rendered]
 

@@ -14,7 +14,7 @@ from demos.examples import warp_loop
 from warpshadow.assets.basis import CellBasis
 from warpshadow.device import cuda_graph, memory
 from warpshadow.device.batch import concatenate
-from warpshadow.device.constants import collected
+from warpshadow.device.constants import collecting_constants
 from warpshadow.device.cuda_graph import Captured, with_gradients
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline import node
@@ -344,7 +344,7 @@ def test_values_that_caches_may_let_go_are_noted_while_they_are_collected(scene,
     normals = static_bodies.normals.value(view.call)
     points = static_bodies.receivers(receivers.static_vertices, normals)
     (rows,) = static_bodies._rows.values()
-    with collected() as held:
+    with collecting_constants() as held:
         cached = rows.of_receivers(receivers, normals)
         static_bodies.receivers(receivers.static_vertices, normals)
         levels = mip_pyramids([wp.zeros((1, 4, 4), dtype=wp.vec3, device=device)]).levels

@@ -31,7 +31,7 @@ def _count_up(first: int, values: wp.array(dtype=wp.int32)):
 def a_thread_has_a_tape_of_its_own():
     outer, inner, seen = wp.Tape(), wp.Tape(), []
     with outer:
-        with warp_internals.own_tape(inner):
+        with warp_internals.thread_tape(inner):
             other = threading.Thread(target=lambda: seen.append(warp_internals.current_tape()))
             other.start()
             other.join()

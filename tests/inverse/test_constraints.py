@@ -41,14 +41,14 @@ def scene(body: ws.Body, ground_turn=(0.0, 0.0, 0.0), height: float = 0.0) -> ws
 
 def prepared(where: ws.Scene, pose: Pose):
     problem = Problem(where, Target(np.full((36, 48, 3), 0.3)), pose)
-    setting = problem.setting(torch.device("cpu"))
+    context = problem.context(torch.device("cpu"))
     (free,) = problem.free
-    return free, setting, free.start(setting)
+    return free, context, free.start(context)
 
 
-def moved_body(free: Pose, setting, values) -> ws.Body:
-    problem = Problem(setting.scene, Target(np.full((36, 48, 3), 0.3)), free)
-    return problem.found({free.name: values}, setting).scene.bodies[0]
+def moved_body(free: Pose, context, values) -> ws.Body:
+    problem = Problem(context.scene, Target(np.full((36, 48, 3), 0.3)), free)
+    return problem.fitted_scene({free.name: values}, context).scene.bodies[0]
 
 
 def shaken(values: dict, seed: int) -> dict:
@@ -60,9 +60,9 @@ def shaken(values: dict, seed: int) -> dict:
 @pytest.mark.parametrize("resting", ["stable", "given", "free"])
 def test_a_body_that_stands_touches_its_plane_at_any_values(resting, seed):
     where = scene(box(TILT, (0.3, 2.0, -0.2)), ground_turn=(10, 0, 5), height=0.4)
-    free, setting, values = prepared(where, Pose("box", stands_on="table", resting=resting))
+    free, context, values = prepared(where, Pose("box", stands_on="table", resting=resting))
     assert values["turn"].numel() + values["shift"].numel() == (5 if resting == "free" else 3)
-    body = moved_body(free, setting, shaken(values, seed))
+    body = moved_body(free, context, shaken(values, seed))
     plane = plane_below(where.bodies[1], np.array([0.0, 5.0, 0.0]))
     heights = np.sort(body.world_mesh().positions.astype(np.float64) @ plane.normal - plane.offset)
     assert abs(heights[0]) < 4 * FLOAT32
@@ -81,8 +81,8 @@ def test_a_body_that_stands_touches_its_plane_at_any_values(resting, seed):
 def test_what_is_fixed_stays_beside_a_plane(ground_turn, fixed, resting):
     where = scene(box(TILT, (0.3, 2.0, -0.2)), ground_turn=ground_turn, height=0.4)
     pose = Pose("box", stands_on="table", resting=resting, fixed=fixed)
-    free, setting, values = prepared(where, pose)
-    body, start = moved_body(free, setting, shaken(values, 4)), where.bodies[0]
+    free, context, values = prepared(where, pose)
+    body, start = moved_body(free, context, shaken(values, 4)), where.bodies[0]
     plane = plane_below(where.bodies[1], np.array(start.translation))
     lowest = (body.world_mesh().positions.astype(np.float64) @ plane.normal).min() - plane.offset
     assert abs(lowest) < 10 * FLOAT32
@@ -151,12 +151,12 @@ def test_the_base_of_a_scan_is_the_plane_nearest_to_all_of_it():
 @pytest.mark.parametrize("resting", ["stable", "given"])
 def test_a_prior_of_the_tilt_counts_in_standard_deviations_at_any_turn(resting):
     where = scene(box(TILT, (0.3, 2.0, -0.2)), ground_turn=(10, 0, 5), height=0.4)
-    free, setting, values = prepared(where, Pose("box", stands_on="table", resting=resting, tilt=0.01))
+    free, context, values = prepared(where, Pose("box", stands_on="table", resting=resting, tilt=0.01))
     assert values["turn"].numel() == 3 and values["shift"].numel() == 2
     for turn, cost in (([1.3, 0.0, 0.0], 0.0), ([0.0, 0.02, 0.0], 4.0), ([0.0, -0.01, 0.02], 5.0)):
         turned = values | {"turn": torch.tensor(turn)}
-        assert abs(float(free.regularizer(turned, setting)) - cost * PRIOR) < 1e-2 * PRIOR
-        body = moved_body(free, setting, turned)
+        assert abs(float(free.regularizer(turned, context)) - cost * PRIOR) < 1e-2 * PRIOR
+        body = moved_body(free, context, turned)
         plane = plane_below(where.bodies[1], np.array([0.0, 5.0, 0.0]))
         lowest = (body.world_mesh().positions.astype(np.float64) @ plane.normal).min() - plane.offset
         assert abs(lowest) < 4 * FLOAT32
@@ -185,8 +185,8 @@ def test_a_scan_that_stands_a_little_tilted_is_found():
 )
 def test_a_pose_keeps_its_axis_and_its_fixed_coordinates(options, turns, stays):
     where = scene(box(TILT))
-    free, setting, values = prepared(where, Pose(0, **options))
-    body = moved_body(free, setting, shaken(values, 2))
+    free, context, values = prepared(where, Pose(0, **options))
+    body = moved_body(free, context, shaken(values, 2))
     turn = Rotation.from_matrix(body.rotation_matrix() @ where.bodies[0].rotation_matrix().T).as_rotvec()
     if turns is not None:
         assert np.linalg.norm(turn) > 0.05
@@ -198,12 +198,12 @@ def test_a_pose_keeps_its_axis_and_its_fixed_coordinates(options, turns, stays):
 
 def test_the_height_has_the_derivative_of_the_lowest_vertex():
     where = scene(box(TILT))
-    free, setting, values = prepared(where, Pose(0, stands_on=1, resting="free", scale=True))
+    free, context, values = prepared(where, Pose(0, stands_on=1, resting="free", scale=True))
     values = {key: tensor.requires_grad_() for key, tensor in shaken(values, 3).items()}
     weights = torch.tensor([0.3, -1.0, 0.7])
 
     def read(place: dict) -> torch.Tensor:
-        return weights @ free.moved(place, setting)[1]
+        return weights @ free.moved(place, context)[1]
 
     read(values).backward()
     for key, tensor in values.items():
@@ -226,7 +226,7 @@ def test_a_tilted_start_that_stands_is_found():
 
 
 def test_candidates_of_a_body_that_stands_turn_about_the_normal():
-    free, setting, values = prepared(scene(box(TILT)), Pose(0, stands_on=1, spread=0.3))
+    free, context, values = prepared(scene(box(TILT)), Pose(0, stands_on=1, spread=0.3))
     turns = [float(free.scattered(values, number, torch.Generator())["turn"]) for number in range(4)]
     np.testing.assert_allclose(turns, [0.3, -0.3, 0.6, -0.6], atol=1e-6)
 
@@ -238,14 +238,14 @@ def test_priors_count_in_standard_deviations():
     low, high = body.mesh.bounds
     size = float(np.linalg.norm(high - low))
     priors = {"distance": (distance + 0.4, 0.2), "size": (size * 1.1, size * 0.05), "covariance": [0.1] * 6}
-    free, setting, values = prepared(where, Pose(0, scale=True, **priors))
-    assert abs(float(free.regularizer(values, setting)) - 8 * PRIOR) < 1e-2 * PRIOR
+    free, context, values = prepared(where, Pose(0, scale=True, **priors))
+    assert abs(float(free.regularizer(values, context)) - 8 * PRIOR) < 1e-2 * PRIOR
     turned = values | {"turn": torch.tensor([0.1, 0.0, -0.2])}
-    assert abs(float(free.regularizer(turned, setting)) - 13 * PRIOR) < 2e-2 * PRIOR
+    assert abs(float(free.regularizer(turned, context)) - 13 * PRIOR) < 2e-2 * PRIOR
     turned["turn"].requires_grad_()
-    free.regularizer(turned, setting).backward()
+    free.regularizer(turned, context).backward()
     np.testing.assert_allclose(turned["turn"].grad, PRIOR * 2 * np.array([0.1, 0, -0.2]) / 0.01, atol=1e-2 * PRIOR)
-    assert prepared(where, Pose(0))[0].regularizer(values, setting) is None
+    assert prepared(where, Pose(0))[0].regularizer(values, context) is None
 
 
 @pytest.mark.parametrize(
@@ -313,7 +313,7 @@ def test_a_body_that_nearly_stands_keeps_the_rotation_of_the_scene():
     where = scene(box((0.8, 30.0, 0.0)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        free, setting, values = prepared(where, Pose("box", stands_on="table"))
-    body = moved_body(free, setting, values)
+        free, context, values = prepared(where, Pose("box", stands_on="table"))
+    body = moved_body(free, context, values)
     np.testing.assert_allclose(body.rotation_matrix(), where.bodies[0].rotation_matrix(), atol=1e-6)
     assert abs(body.world_points()[:, 1].min()) < 4 * FLOAT32

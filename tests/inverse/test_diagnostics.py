@@ -130,11 +130,11 @@ def test_the_gain_is_that_of_the_last_iterations(losses, gain):
 
 
 def test_light_is_kept_from_being_negative_by_default():
-    setting = Problem(scene(), Target(np.ones((16, 16, 3))), Light(2)).setting(torch.device("cpu"))
-    values = Light(2).start(setting)
-    assert float(Light(2).regularizer(values, setting)) == 0
+    context = Problem(scene(), Target(np.ones((16, 16, 3))), Light(2)).context(torch.device("cpu"))
+    values = Light(2).start(context)
+    assert float(Light(2).regularizer(values, context)) == 0
     values["coefficients"][1] = 5.0
-    assert float(Light(2).regularizer(values, setting)) > 0.01
+    assert float(Light(2).regularizer(values, context)) > 0.01
 
 
 @pytest.mark.parametrize("is_found", [False, True])

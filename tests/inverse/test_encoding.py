@@ -202,15 +202,15 @@ def one_ball() -> ws.Scene:
 
 def test_white_balance_is_a_gain_of_each_color():
     problem = Problem(one_ball(), Target(np.full((12, 16, 3), 0.3)), Exposure(white_balance=True), still=None)
-    setting = problem.setting(torch.device("cpu"))
-    model, values = Model(problem, setting, Stage()), problem.start(setting)
+    context = problem.context(torch.device("cpu"))
+    model, values = Model(problem, context, Stage()), problem.start(context)
     with torch.no_grad():
         before = model.images(values)
         values["exposure"]["log"] += np.log(2.0)
         values["exposure"]["log_white"] += torch.tensor([[np.log(3.0), np.log(0.5)]], dtype=torch.float32)
         after = model.images(values)
     np.testing.assert_allclose(after[..., :3], before[..., :3] * torch.tensor([6.0, 2.0, 1.0]), rtol=1e-5)
-    fitted = problem.found(values, setting)
+    fitted = problem.fitted_scene(values, context)
     assert fitted.exposures == pytest.approx([2.0])
     assert fitted.white_balances[0] == pytest.approx((3.0, 1.0, 0.5))
 

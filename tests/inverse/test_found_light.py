@@ -76,7 +76,7 @@ def test_influence_is_the_sum_of_cosines_over_what_is_seen():
     scene = alone()
     problem = inverse.Problem(scene, inverse.Target(ws.render(scene)), inverse.Light(3))
     result = inverse.fit(problem, ONE, progress=False)
-    got = influence_of_cells(problem, result.setting, result.values)
+    got = influence_of_cells(problem, result.context, result.values)
     eye, towards = scene.camera.rays()
     offset = eye - np.array([0, 0.5, 0])
     along = -(towards @ offset)

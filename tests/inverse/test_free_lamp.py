@@ -50,27 +50,27 @@ def problem(image: np.ndarray, *free, start: ws.Scene | None = None) -> Problem:
 
 
 def placed(one: Problem, values: dict) -> ws.Body:
-    setting = one.setting(CPU)
-    return one.found(values, setting).scene.bodies[2]
+    context = one.context(CPU)
+    return one.fitted_scene(values, context).scene.bodies[2]
 
 
 def test_a_lamp_starts_where_the_scene_has_it(photograph):
     one = problem(photograph)
-    lamp = placed(one, one.start(one.setting(CPU)))
+    lamp = placed(one, one.start(one.context(CPU)))
     np.testing.assert_allclose(lamp.translation, PLACE, atol=1e-4)
     assert lamp.scale == pytest.approx(1)
 
 
 def test_a_lamp_keeps_its_size_as_seen_from_the_middle(photograph):
     one = problem(photograph)
-    values = one.start(one.setting(CPU))
+    values = one.start(one.context(CPU))
     values["lamp[2]"]["turn"] += torch.tensor([0.1, -0.2])
     values["lamp[2]"]["log_distance"] += 0.15
     lamp = placed(one, values)
     distance, start = (np.linalg.norm(np.subtract(place, (0, 1, 0))) for place in (lamp.translation, PLACE))
     assert distance > 1.5 * start
     assert lamp.scale / distance == pytest.approx(1 / start, rel=1e-4)
-    moved = Model(one, one.setting(CPU), Stage()).images(values)[0].numpy()
+    moved = Model(one, one.context(CPU), Stage()).images(values)[0].numpy()
     expected = ws.Renderer(scene(BODY, GROUND, lamp)).render()
     assert np.linalg.norm(moved - expected) < CELL_LIGHT * np.linalg.norm(expected)
     assert np.linalg.norm(moved[..., :3] - photograph) > 0.1 * np.linalg.norm(photograph)
@@ -78,11 +78,11 @@ def test_a_lamp_keeps_its_size_as_seen_from_the_middle(photograph):
 
 def test_searches_start_all_over_the_upper_hemisphere(photograph):
     one = problem(photograph)
-    setting = one.setting(CPU)
-    lamp, start = Lamp(2), one.start(setting)
+    context = one.context(CPU)
+    lamp, start = Lamp(2), one.start(context)
     towards = []
     for number in range(STARTS):
-        body = placed(one, start | {"lamp[2]": lamp.relocated(start["lamp[2]"], setting, number)})
+        body = placed(one, start | {"lamp[2]": lamp.relocated(start["lamp[2]"], context, number)})
         offset = np.subtract(body.translation, (0, 1, 0))
         assert np.linalg.norm(offset) == pytest.approx(np.linalg.norm(PLACE - (0, 1, 0)), rel=1e-3)
         towards.append(offset / np.linalg.norm(offset))
@@ -93,10 +93,10 @@ def test_searches_start_all_over_the_upper_hemisphere(photograph):
 
 def test_the_gradient_of_a_place_is_that_of_the_loss_at_the_best_light_and_emission(photograph):
     one = problem(photograph)
-    setting = one.setting(CPU)
-    values = one.start(setting)
+    context = one.context(CPU)
+    values = one.start(context)
     values["lamp[2]"]["turn"] += torch.tensor([0.03, 0.02])
-    model = ProjectedModel(one, setting, SOLVED)
+    model = ProjectedModel(one, context, SOLVED)
     places = values["lamp[2]"]
     for tensor in places.values():
         tensor.requires_grad_()
@@ -118,16 +118,16 @@ def test_the_gradient_of_a_place_is_that_of_the_loss_at_the_best_light_and_emiss
 def test_emission_of_one_color_is_solved_for_beside_the_map(photograph):
     dim = dataclasses.replace(LAMP, emission=(2, 2, 2))
     one = problem(photograph, start=scene(BODY, GROUND, dim))
-    setting = one.setting(CPU)
-    values = one.start(setting)
-    model = ProjectedModel(one, setting, SOLVED)
+    context = one.context(CPU)
+    values = one.start(context)
+    model = ProjectedModel(one, context, SOLVED)
     with torch.no_grad():
         model.solve(values)
         least = float(model.loss(values)[0])
-    fitted = one.found(values, setting).scene
+    fitted = one.fitted_scene(values, context).scene
     np.testing.assert_allclose(fitted.bodies[2].emission, LAMP.emission, rtol=0.05)
     assert fitted.light.radiance.mean() == pytest.approx(0.4, rel=0.1)
-    plain, solution = Model(one, setting, Stage()), values["emission[2]"]["radiance"].clone()
+    plain, solution = Model(one, context, Stage()), values["emission[2]"]["radiance"].clone()
     for factor in (0.9, 1.1):
         values["emission[2]"]["radiance"] = factor * solution
         assert float(plain.loss(values)[0]) > 1.5 * least
@@ -138,19 +138,19 @@ def test_a_lamp_that_is_not_free_is_taken_as_it_is(photograph):
     both = scene(BODY, GROUND, LAMP, second)
     image = np.asarray(ws.Renderer(both).render()[..., :3])
     one = problem(image, CELLS, Emission("lamp"), start=both)
-    setting = one.setting(CPU)
-    values = one.start(setting)
+    context = one.context(CPU)
+    values = one.start(context)
     with torch.no_grad():
-        ProjectedModel(one, setting, SOLVED).solve(values)
-    np.testing.assert_allclose(one.found(values, setting).scene.bodies[2].emission, LAMP.emission, rtol=0.05)
+        ProjectedModel(one, context, SOLVED).solve(values)
+    np.testing.assert_allclose(one.fitted_scene(values, context).scene.bodies[2].emission, LAMP.emission, rtol=0.05)
 
 
 def test_what_is_solved_for_is_not_among_the_uncertain_numbers(photograph):
     one = problem(photograph)
-    normal = NormalMatrix(one, one.setting(CPU), one.start(one.setting(CPU)))
+    normal = NormalMatrix(one, one.context(CPU), one.start(one.context(CPU)))
     assert {name for name, _, _ in normal.parameter_entries} == {"lamp[2]"}
     without_map = problem(photograph, Lamp("lamp"), Emission("lamp"))
-    normal = NormalMatrix(without_map, one.setting(CPU), without_map.start(one.setting(CPU)))
+    normal = NormalMatrix(without_map, one.context(CPU), without_map.start(one.context(CPU)))
     assert {name for name, _, _ in normal.parameter_entries} == {"lamp[2]", "emission[2]"}
 
 

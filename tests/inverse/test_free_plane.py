@@ -40,13 +40,13 @@ def scene(turn=(0.0, 0.0, 0.0), height: float = 0.0, **standing) -> ws.Scene:
 
 
 def shaken(problem: Problem, seed: int):
-    setting = problem.setting(torch.device("cpu"))
+    context = problem.context(torch.device("cpu"))
     generator = torch.Generator().manual_seed(seed)
     values = {
         name: {key: tensor + 0.3 * torch.randn(tensor.shape, generator=generator) for key, tensor in own.items()}
-        for name, own in problem.start(setting).items()
+        for name, own in problem.start(context).items()
     }
-    return values, setting
+    return values, context
 
 
 def lowest(body: ws.Body, plane) -> float:
@@ -58,8 +58,8 @@ def test_bodies_stay_on_the_plane_wherever_it_moves(resting):
     where = scene((6, 0, -4), 0.3, translation=(0.3, 2.0, -0.2))
     free = [Plane("table", carries=["crate"]), Pose("box", stands_on="table", resting=resting)]
     problem = Problem(where, Target(GRAY), free)
-    values, setting = shaken(problem, 1)
-    bodies = problem.found(values, setting).scene.bodies
+    values, context = shaken(problem, 1)
+    bodies = problem.fitted_scene(values, context).scene.bodies
     before, after = (plane_below(table, np.array([0, 9.0, 0])) for table in (where.bodies[1], bodies[1]))
     assert before.normal @ after.normal < 0.999 and abs(lowest(bodies[0], after)) < FLOAT32
     assert abs(lowest(bodies[2], after) - lowest(where.bodies[2], before)) < FLOAT32
@@ -70,10 +70,10 @@ def test_bodies_stay_on_the_plane_wherever_it_moves(resting):
 
 def test_a_fit_renders_the_bodies_where_they_are_found():
     problem = Problem(scene(), Target(GRAY), [Pose("box", stands_on="table"), Plane("table", carries=["crate"])])
-    values, setting = shaken(problem, 2)
+    values, context = shaken(problem, 2)
     with torch.no_grad():
-        image = Model(problem, setting, Stage()).images(values)[0]
-    found = ws.render(problem.found(values, setting).scene)
+        image = Model(problem, context, Stage()).images(values)[0]
+    found = ws.render(problem.fitted_scene(values, context).scene)
     np.testing.assert_allclose(image, found, atol=1e-4)
 
 
@@ -86,8 +86,8 @@ def test_images_have_the_derivatives_of_a_plane_that_bodies_shadow():
         where, bodies=(*where.bodies[:2], crate), light=light, visibility=ws.Visibility(directions=64)
     )
     problem = Problem(where, Target(GRAY), Plane("table"))
-    setting = problem.setting(torch.device("cpu"))
-    model, start = Model(problem, setting, Stage()), problem.start(setting)["plane[1]"]
+    context = problem.context(torch.device("cpu"))
+    model, start = Model(problem, context, Stage()), problem.start(context)["plane[1]"]
     weights = torch.linspace(0.5, 1.5, 48)[None, None, :, None]
 
     def total(step: dict) -> torch.Tensor:
@@ -107,37 +107,37 @@ def test_points_tell_where_the_plane_is():
     flat = np.random.default_rng(0).uniform(-2, 2, (20, 3)) * (1, 0, 1)
     points = true_turn.apply(flat) + (0, 0.25, 0)
     problem = Problem(scene(), Target(GRAY), Plane("table", points=points, deviation=0.01))
-    setting = problem.setting(torch.device("cpu"))
-    values = problem.start(setting)
+    context = problem.context(torch.device("cpu"))
+    values = problem.start(context)
     (free,) = problem.free
-    plane = plane_below(problem.found(values, setting).scene.bodies[1], np.array([0, 9.0, 0]))
+    plane = plane_below(problem.fitted_scene(values, context).scene.bodies[1], np.array([0, 9.0, 0]))
     np.testing.assert_allclose(points @ plane.normal - plane.offset, 0, atol=FLOAT32)
-    assert float(free.regularizer(values[free.name], setting)) < 1e-4 * PRIOR
+    assert float(free.regularizer(values[free.name], context)) < 1e-4 * PRIOR
     values["plane[1]"]["height"] += 0.02
-    reached = problem.found(values, setting).scene.bodies[1]
+    reached = problem.fitted_scene(values, context).scene.bodies[1]
     gaps = points @ plane.normal - plane_below(reached, np.array([0, 9.0, 0])).offset
     expected = PRIOR * (gaps**2).sum() / 0.01**2
-    assert float(free.regularizer(values[free.name], setting)) == pytest.approx(expected, rel=1e-3)
+    assert float(free.regularizer(values[free.name], context)) == pytest.approx(expected, rel=1e-3)
 
 
 def test_priors_and_their_derivatives_are_in_standard_deviations():
     points = np.random.default_rng(0).uniform(-2, 2, (5, 3))
     free = Plane("table", height=0.1, tilt=0.05, points=points, deviation=0.5)
     problem = Problem(scene(), Target(GRAY), [dataclasses.replace(free, points=None, deviation=None)])
-    setting = problem.setting(torch.device("cpu"))
+    context = problem.context(torch.device("cpu"))
     plain, values = problem.free[0], {"tilt": torch.tensor([0.05, -0.1]), "height": torch.tensor(0.0)}
-    assert float(plain.regularizer(values, setting)) == pytest.approx(5 * PRIOR, rel=1e-5)
+    assert float(plain.regularizer(values, context)) == pytest.approx(5 * PRIOR, rel=1e-5)
     values["tilt"].requires_grad_()
     values["height"] = torch.tensor(0.1).requires_grad_()
     whole = free.numbered(problem.scene)
-    whole.regularizer(values, setting).backward()
+    whole.regularizer(values, context).backward()
     for key, tensor in values.items():
         for number in range(tensor.numel()):
             ends = []
             for step in (1e-2, -1e-2):
                 moved = {name: own.detach().clone() for name, own in values.items()}
                 moved[key].view(-1)[number] += step
-                ends.append(float(whole.regularizer(moved, setting)) / PRIOR)
+                ends.append(float(whole.regularizer(moved, context)) / PRIOR)
             slope = (ends[0] - ends[1]) / 2e-2
             assert float(tensor.grad.view(-1)[number]) / PRIOR == pytest.approx(slope, rel=5e-3)
 

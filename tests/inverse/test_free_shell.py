@@ -89,7 +89,7 @@ def test_light_that_a_fit_finds_keeps_its_radius():
 
 def test_the_gradient_of_a_loss_is_that_of_differences():
     problem = problem_of(window(4.0), window(2.0), inverse.Shell())
-    model = Model(problem, problem.setting(torch.device("cpu")), inverse.Stage())
+    model = Model(problem, problem.context(torch.device("cpu")), inverse.Stage())
 
     def loss(gap):
         return model.loss({"shell": {"log_gap": gap}})[0]
@@ -103,7 +103,7 @@ def test_the_gradient_of_a_loss_is_that_of_differences():
 
 def test_bodies_stay_within_the_shell():
     problem = problem_of(DIM, window(2.0), inverse.Shell())
-    shell = inverse.Shell().shell({"log_gap": torch.tensor(-50.0)}, problem.setting(torch.device("cpu")))
+    shell = inverse.Shell().shell({"log_gap": torch.tensor(-50.0)}, problem.context(torch.device("cpu")))
     farthest = max(np.linalg.norm(body.world_points() - CENTER, axis=1).max() for body in BODIES)
     assert farthest < float(shell[3]) < 1.05 * farthest
 

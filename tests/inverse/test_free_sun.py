@@ -87,8 +87,8 @@ def test_a_sun_is_found_by_the_scenes_own_method_in_as_many_cells():
 @pytest.mark.parametrize("still", ["ray-traced", "directional"])
 def test_gradients_of_the_loss_are_those_of_differences(still):
     problem = problem_of(inverse.Sun(**START, angular_radius=25.0), 3.0, still=ws.Visibility(still))
-    setting = problem.setting(CPU)
-    model, values = Model(problem, setting, inverse.Stage()), problem.start(setting)
+    context = problem.context(CPU)
+    model, values = Model(problem, context, inverse.Stage()), problem.start(context)
     for tensor in values["sun"].values():
         tensor.requires_grad_()
     model.loss(values)[0].backward()
@@ -107,11 +107,11 @@ def test_gradients_of_the_loss_are_those_of_differences(still):
 
 
 def test_its_cells_light_as_the_sun_does_wherever_it_is():
-    setting = problem_of(inverse.Sun(**START)).setting(CPU)
+    context = problem_of(inverse.Sun(**START)).context(CPU)
     rng = np.random.default_rng(0)
     for direction in rng.normal(size=(20, 3)):
         sun = inverse.Sun(direction, IRRADIANCE)
-        light = sun.coefficients(sun.start(setting), setting).numpy()
+        light = sun.coefficients(sun.start(context), context).numpy()
         assert (light >= 0).all()
         direction /= np.linalg.norm(direction)
         mean = light.sum(axis=1) @ sun.basis.directions

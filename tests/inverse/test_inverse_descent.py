@@ -142,10 +142,10 @@ def test_a_stage_of_a_part_of_a_pixel_rounds_and_corrects_its_camera():
     """The scene explains its own image at sizes that are no whole part of it; by intrinsics times the scale, worse."""
     scene = dataclasses.replace(small_scene(size=(61, 47)), supersampling=4)
     problem = Problem(scene, Target(ws.Renderer(scene).render()), Pose(0))
-    setting = problem.setting(torch.device("cpu"))
+    context = problem.context(torch.device("cpu"))
     for scale in (1 / 2, 0.3, 1 / 4):
-        model = Model(problem, setting, Stage(scale=scale))
-        image, target = model.images(problem.start(setting))[0].detach().numpy(), model.targets[0].numpy()
+        model = Model(problem, context, Stage(scale=scale))
+        image, target = model.images(problem.start(context))[0].detach().numpy(), model.targets[0].numpy()
         assert image.shape == target.shape == (round(47 * scale), round(61 * scale), 4)
         intrinsics = np.diag([scale, scale, 1]) @ scene.camera.intrinsics
         uncorrected = ws.Renderer(
@@ -293,7 +293,7 @@ def test_a_stage_begins_where_the_last_one_ended_in_loss_as_well():
 def test_candidates_of_a_pose_are_turned_by_its_spread_each_another_way(rotation):
     pose = Pose(0, rotation, spread=0.4)
     problem = small_problem(pose)
-    start = problem.start(problem.setting(torch.device("cpu")))[pose.name]
+    start = problem.start(problem.context(torch.device("cpu")))[pose.name]
     generator = torch.Generator().manual_seed(0)
     turns = [pose.scattered(start, number, generator)["turn"] for number in range(15)]
     matrices = rotation_matrices(torch.stack(turns)).numpy().astype(np.float64)
@@ -354,7 +354,7 @@ def test_the_result_has_the_values_of_the_least_loss(problem):
     images = torch.from_numpy(result.images())
     target = torch.from_numpy(problem.targets[0].image)[None]
     weights = torch.ones(images.shape[:3])
-    assert float(problem.loss(images, target, weights, result.setting.unit)) == pytest.approx(min(losses), rel=1e-5)
+    assert float(problem.loss(images, target, weights, result.context.unit)) == pytest.approx(min(losses), rel=1e-5)
 
 
 def test_a_fit_is_the_same_each_time(problem):

@@ -91,8 +91,8 @@ def blank(views: int = 1) -> list[Target]:
 
 def prepared(scene, free, targets=None) -> tuple[Problem, object, dict]:
     problem = Problem(scene, blank() if targets is None else targets, free, still=None)
-    setting = problem.setting(torch.device("cpu"))
-    return problem, setting, problem.start(setting)
+    context = problem.context(torch.device("cpu"))
+    return problem, context, problem.start(context)
 
 
 def moved(values: dict, amount: float, seed: int = 0) -> dict:
@@ -104,8 +104,8 @@ def moved(values: dict, amount: float, seed: int = 0) -> dict:
     }
 
 
-def images_of(problem, setting, values) -> np.ndarray:
-    return Result(problem, setting, values, [[]], "", math.nan).images()
+def images_of(problem, context, values) -> np.ndarray:
+    return Result(problem, context, values, [[]], "", math.nan).images()
 
 
 def clear_of_outlines(scene: ws.Scene) -> np.ndarray:
@@ -153,8 +153,8 @@ FREE = {
     ],
 )
 def test_what_is_free_says_which_bodies_move(scene, free, expected, monkeypatch):
-    problem, setting, values = prepared(scene, free)
-    model = Model(problem, setting, Stage())
+    problem, context, values = prepared(scene, free)
+    model = Model(problem, context, Stage())
     given = []
     forward = model.renderer.forward
 
@@ -172,7 +172,7 @@ def test_what_is_free_says_which_bodies_move(scene, free, expected, monkeypatch)
 def test_each_starts_where_the_scene_has_it(scene, dim_scene, case):
     in_cells = case == "light in cells"
     scene = dim_scene if in_cells else scene
-    problem, setting, values = prepared(scene, FREE[case])
+    problem, context, values = prepared(scene, FREE[case])
     if any(isinstance(each, (Deformation, Radii)) for each in FREE[case]):  # a free shape shadows itself by its spheres
         visibility = dataclasses.replace(scene.visibility, self_shadows="spheres")
         scene = dataclasses.replace(scene, visibility=visibility)
@@ -182,20 +182,20 @@ def test_each_starts_where_the_scene_has_it(scene, dim_scene, case):
         reference = ws.torch.TorchRenderer(scene, basis=problem.basis)(light).numpy()
     else:
         reference = expected.render()
-    assert np.abs(images_of(problem, setting, values)[0] - reference).max() < POSED * reference.max()
+    assert np.abs(images_of(problem, context, values)[0] - reference).max() < POSED * reference.max()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [case for case in FREE if case not in ("exposure", "light in cells")])
 def test_the_scene_that_is_found_has_the_images_of_the_fit(scene, case):
     """With values away from the start, seen from two sides."""
-    problem, setting, start = prepared(scene, FREE[case], blank(VIEWS))
+    problem, context, start = prepared(scene, FREE[case], blank(VIEWS))
     values = moved(start, 0.02)
     for free in problem.free:
         free.project(values[free.name])
-    found = problem.found(values, setting)
-    got = images_of(problem, setting, values)
-    assert np.abs(got - images_of(problem, setting, start)).max() > 1e-3  # what is to be found is not nothing
+    found = problem.fitted_scene(values, context)
+    got = images_of(problem, context, values)
+    assert np.abs(got - images_of(problem, context, start)).max() > 1e-3  # what is to be found is not nothing
     for view, seen_by in enumerate(found.cameras):
         expected = ws.Renderer(dataclasses.replace(found.scene, camera=seen_by)).render()
         assert np.abs(got[view] - expected).max() < POSED * expected.max()
@@ -207,39 +207,39 @@ def test_a_body_turns_about_its_middle_and_grows_from_there(scene, rotation):
     ball, ground = scene.bodies
     aside = dataclasses.replace(ball, mesh=ball.mesh.transformed(translation=np.array([0.5, -0.3, 0.2])))
     scene = dataclasses.replace(scene, bodies=(aside, ground))
-    problem, setting, values = prepared(scene, [Pose(BALL, rotation, scale=True)])
+    problem, context, values = prepared(scene, [Pose(BALL, rotation, scale=True)])
     values["pose[0]"]["turn"] += torch.randn(
         values["pose[0]"]["turn"].shape, generator=torch.Generator().manual_seed(0)
     )
     values["pose[0]"]["log_scale"] += math.log(1.5)
-    found = problem.found(values, setting).scene.bodies[BALL]
-    middle = setting.middle(BALL)
+    found = problem.fitted_scene(values, context).scene.bodies[BALL]
+    middle = context.middle(BALL)
     before, after = (body.to_world(middle) for body in (aside, found))
     assert np.abs(found.rotation - aside.rotation).max() > 10 and found.scale == pytest.approx(1.2)
     assert np.allclose(after, before, atol=1e-6)
 
 
 def test_light_of_cells_settles_as_a_map_of_the_same_cells(dim_scene):
-    problem, setting, start = prepared(dim_scene, [Light(None, 64)])
+    problem, context, start = prepared(dim_scene, [Light(None, 64)])
     values = moved(start, 0.3)
-    light = problem.found(values, setting).scene.light
-    wanted = problem.free[0].coefficients(values["light"], setting).numpy()
+    light = problem.fitted_scene(values, context).scene.light
+    wanted = problem.free[0].coefficients(values["light"], context).numpy()
     assert np.abs(problem.basis.coefficients(light) / wanted - 1).max() < FLOAT32
 
 
 def test_exposures_settle_as_factors_and_leave_coverage_alone(scene):
-    problem, setting, start = prepared(scene, [Exposure()], blank(VIEWS))
+    problem, context, start = prepared(scene, [Exposure()], blank(VIEWS))
     values = {"exposure": {"log": torch.tensor([0.5, -0.25])}}
     factors = np.exp([0.5, -0.25])
-    assert np.allclose(problem.found(values, setting).exposures, factors)
-    before, after = images_of(problem, setting, start), images_of(problem, setting, values)
+    assert np.allclose(problem.fitted_scene(values, context).exposures, factors)
+    before, after = images_of(problem, context, start), images_of(problem, context, values)
     assert np.allclose(after[..., :3], before[..., :3] * factors[:, None, None, None], rtol=1e-6)
     assert np.array_equal(after[..., 3], before[..., 3])
 
 
 def test_two_views_are_the_images_of_two_cameras(scene):
-    problem, setting, values = prepared(scene, [Pose(BALL)], blank(VIEWS))
-    images = images_of(problem, setting, values)
+    problem, context, values = prepared(scene, [Pose(BALL)], blank(VIEWS))
+    images = images_of(problem, context, values)
     for view in range(VIEWS):
         expected = ws.Renderer(dataclasses.replace(scene, camera=camera(view))).render()
         assert np.abs(images[view] - expected).max() < FLOAT32 * expected.max()
@@ -249,8 +249,8 @@ def test_two_views_are_the_images_of_two_cameras(scene):
 def test_spheres_that_a_still_scene_does_not_need_are_in_what_is_found(scene):
     """Rays need no spheres, but the found scene has its own method again and must not lose its shadow."""
     problem = Problem(scene, blank(), [Albedo(BALL)], still=ws.Visibility("ray-traced", samples=16))
-    setting = problem.setting(torch.device("cpu"))
-    found = problem.found(problem.start(setting), setting)
+    context = problem.context(torch.device("cpu"))
+    found = problem.fitted_scene(problem.start(context), context)
     expected = ws.Renderer(scene).render()
     assert np.abs(ws.Renderer(found.scene).render() - expected).max() < FLOAT32 * expected.max()
 
@@ -259,10 +259,10 @@ def test_a_texture_starts_from_a_color_and_at_another_size(scene):
     ball, ground = scene.bodies
     color = (0.2, 0.4, 0.6)
     plain = dataclasses.replace(scene, bodies=(ball, dataclasses.replace(ground, texture=None, albedo=color)))
-    problem, setting, values = prepared(plain, [Texture(GROUND, size=(7, 9))])
+    problem, context, values = prepared(plain, [Texture(GROUND, size=(7, 9))])
     texels = values["texture[1]"]["texels"]
     assert texels.shape == (7, 9, 3) and torch.allclose(texels, torch.tensor(color))
-    assert np.abs(images_of(problem, setting, values)[0] - ws.Renderer(plain).render()).max() < FLOAT32 * 3
+    assert np.abs(images_of(problem, context, values)[0] - ws.Renderer(plain).render()).max() < FLOAT32 * 3
     halved = Texture(GROUND, size=(3, 5)).start(setting_of(scene))["texels"].numpy()
     assert np.allclose(halved, ground.texture.reshape(3, 2, 5, 3).mean(axis=1), atol=1e-6)
 
@@ -297,12 +297,12 @@ def test_a_palette_starts_as_the_texture_has_it_and_as_grays_where_that_is_plain
     ball, ground = scene.bodies
     tiles = np.where(np.indices((8, 8)).sum(axis=0)[..., None] % 2, [0.9, 0.8, 0.7], [0.1, 0.0, 0.1]).astype(np.float32)
     for texture, expected in ((tiles, [[0.1, 0, 0.1], [0.9, 0.8, 0.7]]), (None, [[0.25] * 3, [0.75] * 3])):
-        setting = setting_of(
+        context = setting_of(
             dataclasses.replace(scene, bodies=(ball, dataclasses.replace(ground, texture=texture, albedo=(0.5,) * 3)))
         )
-        start = Texture(GROUND, palette=1.0).start(setting)
+        start = Texture(GROUND, palette=1.0).start(context)
         assert np.allclose(start["palette"].numpy(), expected, atol=1e-6)
-        assert set(Texture(GROUND).start(setting)) == {"texels"}
+        assert set(Texture(GROUND).start(context)) == {"texels"}
 
 
 @pytest.mark.parametrize(
@@ -328,8 +328,8 @@ def test_what_textures_are_likely_to_be_tells_a_shadow_from_paint(options, toler
 
 
 def test_a_texture_is_found_where_light_bounces(scene):
-    problem, setting, values = prepared(dataclasses.replace(scene, bounces=1), [Texture(GROUND)])
-    found = problem.found(values, setting).scene
+    problem, context, values = prepared(dataclasses.replace(scene, bounces=1), [Texture(GROUND)])
+    found = problem.fitted_scene(values, context).scene
     assert found.bounces == 1
     assert found.bodies[GROUND].texture.shape == scene.bodies[GROUND].texture.shape
 
@@ -341,14 +341,14 @@ def setting_of(scene):
 # ---------------------------------------------------------------------------------------------- gradients
 
 
-def loss_of(problem, setting) -> Callable[[dict], torch.Tensor]:
+def loss_of(problem, context) -> Callable[[dict], torch.Tensor]:
     """The loss that a fit descends as a function of values, of images at full size, regularizers included."""
-    model = Model(problem, setting, Stage())
+    model = Model(problem, context, Stage())
 
     def loss(values: dict) -> torch.Tensor:
-        energies = [free.regularizer(values[free.name], setting) for free in problem.free]
+        energies = [free.regularizer(values[free.name], context) for free in problem.free]
         images = model.images(values).double()  # so that differences of sums over pixels are not of float32
-        unlikeness = problem.loss(images, model.targets, model.weights, setting.unit)
+        unlikeness = problem.loss(images, model.targets, model.weights, context.unit)
         return sum((regularizer for regularizer in energies if regularizer is not None), unlikeness)
 
     return loss
@@ -387,10 +387,10 @@ def test_the_gradient_of_the_loss_is_its_central_difference(soft_scene, dim_scen
     scene = dim_scene if case == "light in cells" else soft_scene
     mask = clear_of_outlines(scene) if case in MESHES_MOVE else None
     pattern = np.random.default_rng(1).uniform(0, 1, (6, 8, 4)).repeat(4, axis=0).repeat(4, axis=1)
-    problem, setting, start = prepared(scene, free, [Target(pattern, mask=mask)])
+    problem, context, start = prepared(scene, free, [Target(pattern, mask=mask)])
     values = moved(start, 0.02, seed=1)
     leaves = {(name, key): tensor.requires_grad_() for name, own in values.items() for key, tensor in own.items()}
-    loss = loss_of(problem, setting)
+    loss = loss_of(problem, context)
     loss(values).backward()
     generator = torch.Generator().manual_seed(2)
     # each direction with its largest number 1, so that no number takes more than a step
@@ -423,12 +423,12 @@ def test_the_gradient_of_the_loss_is_its_central_difference(soft_scene, dim_scen
 
 def test_every_free_number_of_a_posed_body_has_an_influence(scene):
     """So that no rotation is passed over: the lump's shadow shows all three."""
-    problem, setting, start = prepared(
+    problem, context, start = prepared(
         scene, [Pose(BALL, scale=True)], [Target(ws.Renderer(scene).render()[..., :3] * 0.7)]
     )
     values = moved(start, 0.01)
     leaves = [tensor.requires_grad_() for tensor in values["pose[0]"].values()]
-    loss_of(problem, setting)(values).backward()
+    loss_of(problem, context)(values).backward()
     assert all((leaf.grad.abs() > 1e-4).all() for leaf in leaves)
 
 
@@ -459,19 +459,19 @@ ITERATIONS = 60
 def test_each_recovers_the_truth(scene, dim_scene, case):
     free, distance, rate, remains = RECOVERY[case]
     scene = dim_scene if case == "light in cells" else scene
-    problem, setting, start = prepared(scene, free, blank(VIEWS))
+    problem, context, start = prepared(scene, free, blank(VIEWS))
     truth = moved(start, distance, seed=5)
     for parameter in free:
         parameter.project(truth[parameter.name])
-    images = images_of(problem, setting, truth)
+    images = images_of(problem, context, truth)
     targets = [Target(image, camera=camera(view)) for view, image in enumerate(images)]
     # light is in units of the targets, which were blank
-    unit = setting.unit
+    unit = context.unit
     problem = Problem(scene, targets, free, still=None)
-    setting = problem.setting(torch.device("cpu"))
-    start = problem.start(setting)
+    context = problem.context(torch.device("cpu"))
+    start = problem.start(context)
     if "light in harmonics" in case:
-        truth["light"]["coefficients"] *= unit / setting.unit
+        truth["light"]["coefficients"] *= unit / context.unit
     result = fit(problem, [Stage(ITERATIONS, learning_rate=rate)])
     assert min(result.losses[-1]) < 0.05 * result.losses[0][0]
     after, before = (np.abs(found - images).mean() for found in (result.images(), result.images_at_start()))

@@ -46,11 +46,11 @@ def lit_problem(light: Light, *, views: int = 1, channels: int = 3, **options) -
 @pytest.mark.parametrize("light", [Light(3, nonnegativity=0.5), Light(None, 32)], ids=["harmonics", "cells"])
 def test_light_alone_has_the_loss_of_its_images_and_its_gradient(light, views, reduction, still):
     problem = lit_problem(light, views=views, channels=4, loss=Loss(reduction=reduction, coverage=0.3), still=still)
-    setting = problem.setting(CPU)
-    start = problem.start(setting)
+    context = problem.context(CPU)
+    start = problem.start(context)
     generator = torch.Generator().manual_seed(0)
     results = []
-    for model in (make_model(problem, setting, Stage(scale=0.5)), Model(problem, setting, Stage(scale=0.5))):
+    for model in (make_model(problem, context, Stage(scale=0.5)), Model(problem, context, Stage(scale=0.5))):
         generator.manual_seed(0)
         values = {
             name: {
@@ -61,7 +61,7 @@ def test_light_alone_has_the_loss_of_its_images_and_its_gradient(light, views, r
         loss, _ = model.loss(values)
         loss.backward()
         results.append((loss.item(), *(tensor.grad for tensor in values["light"].values())))
-    assert isinstance(make_model(problem, setting, Stage()), LightModel)
+    assert isinstance(make_model(problem, context, Stage()), LightModel)
     (short, short_gradient), (long, long_gradient) = results
     assert short == pytest.approx(long, rel=1e-5)
     assert (short_gradient - long_gradient).abs().max() < 1e-5 * long_gradient.abs().max()
@@ -72,10 +72,10 @@ def test_the_loss_of_light_that_explains_all_is_zero_and_never_much_below():
     scene = scene_of()
     scene = dataclasses.replace(scene, camera=scene.camera.resized(8))
     problem = Problem(scene, Target(ws.render(scene)[..., :3]), Light(3), still=None)
-    setting = problem.setting(CPU)
-    values = problem.start(setting)
-    short, _ = make_model(problem, setting, Stage()).loss(values)
-    long, _ = Model(problem, setting, Stage()).loss(values)
+    context = problem.context(CPU)
+    values = problem.start(context)
+    short, _ = make_model(problem, context, Stage()).loss(values)
+    long, _ = Model(problem, context, Stage()).loss(values)
     assert abs(long.item()) < 1e-11 and abs(short.item()) < 1e-11
 
 
@@ -85,16 +85,16 @@ def test_the_loss_of_light_that_explains_all_is_zero_and_never_much_below():
 )
 def test_what_is_no_quadratic_form_of_light_is_computed_by_images(free, options):
     problem = Problem(scene_of(), Target(np.ones((16, 24, 3))), free, still=None, **options)
-    assert type(make_model(problem, problem.setting(CPU), Stage())) is Model
+    assert type(make_model(problem, problem.context(CPU), Stage())) is Model
 
 
 def test_small_images_of_moving_bodies_are_shaded_where_they_are_seen():
     """Where a coarse stage has fewer samples than vertices, light is evaluated at samples, for about the same image."""
     scene = scene_of(segments=128)
     problem = Problem(scene, Target(ws.render(scene)), Pose(0), still=None)
-    setting = problem.setting(CPU)
+    context = problem.context(CPU)
     with torch.no_grad():
-        image = Model(problem, setting, Stage(scale=0.5)).images(problem.start(setting))[0].numpy()
+        image = Model(problem, context, Stage(scale=0.5)).images(problem.start(context))[0].numpy()
     half = dataclasses.replace(scene, camera=scene.camera.resized(0.5))
     by_pixel = tuple(dataclasses.replace(body, receivers="pixel") for body in scene.bodies)
     expected = ws.render(dataclasses.replace(half, bodies=by_pixel))
@@ -119,6 +119,6 @@ def test_a_fit_has_grounds_block_as_its_scene_has_them():
     )
     image = ws.render(scene)
     problem = Problem(scene, [Target(image)], [Pose(0)])
-    setting = problem.setting(CPU)
-    found = problem.found(problem.start(setting), setting).scene
+    context = problem.context(CPU)
+    found = problem.fitted_scene(problem.start(context), context).scene
     np.testing.assert_allclose(ws.render(found), image, atol=1e-5)

@@ -150,10 +150,10 @@ def test_masked_pixels_have_no_influence_whatever_is_in_them(scale):
 def test_the_unit_is_the_root_mean_square_of_what_counts():
     scene = small_scene()
     image, mask = noise(24, 24, 4), noise(24, 24, seed=1)
-    setting = Problem(scene, Target(image, mask), Exposure()).setting(CPU)
+    context = Problem(scene, Target(image, mask), Exposure()).context(CPU)
     color = image[..., :3].astype(np.float64)
-    assert setting.unit == pytest.approx(np.sqrt((mask[..., None] * color**2).sum() / (3 * mask.sum())))
-    assert Problem(scene, Target(np.zeros((24, 24, 3))), Exposure()).setting(CPU).unit == 1
+    assert context.unit == pytest.approx(np.sqrt((mask[..., None] * color**2).sum() / (3 * mask.sum())))
+    assert Problem(scene, Target(np.zeros((24, 24, 3))), Exposure()).context(CPU).unit == 1
 
 
 def test_arrays_are_targets_as_they_are():
@@ -305,7 +305,7 @@ def test_one_color_starts_as_the_mean_of_the_colors_of_vertices(free):
     colors = noise(ground.mesh.vertex_count, 3)
     scene = dataclasses.replace(scene, bodies=(ball, dataclasses.replace(ground, albedo=colors)))
     problem = Problem(scene, Target(noise(24, 24, 3)), free)
-    (start,) = free.start(problem.setting(torch.device("cpu"))).values()
+    (start,) = free.start(problem.context(torch.device("cpu"))).values()
     np.testing.assert_allclose(start, np.broadcast_to(colors.mean(axis=0), start.shape), rtol=1e-5)
 
 
@@ -372,7 +372,7 @@ def test_visibility_is_by_rays_where_all_stands_still_and_by_the_scenes_method_w
         "log-sh": Problem(small_scene(method="log-sh"), target, [Light()], still=None),
     }
     for method, problem in methods.items():
-        assert problem.setting(CPU).scene.visibility.method == method
+        assert problem.context(CPU).scene.visibility.method == method
 
 
 # ---------------------------------------------------------------------------------------------- fingerprints
@@ -445,7 +445,7 @@ def test_fingerprints_differ_where_anything_does_that_a_result_depends_on():
 def test_fingerprints_do_not_change_with_being_asked_or_made_again_or_with_what_is_masked_out():
     problem = variations()["itself"]
     before = problem.fingerprint()
-    problem.start(problem.setting(CPU))  # what is made on the way is no part of it
+    problem.start(problem.context(CPU))  # what is made on the way is no part of it
     assert problem.basis is not None and problem.fingerprint() == before == variations()["itself"].fingerprint()
     image, mask = noise(24, 24, 3), np.ones((24, 24))
     mask[3, 4] = 0

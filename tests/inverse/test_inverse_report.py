@@ -185,7 +185,7 @@ def test_the_loss_after_is_that_of_the_values_at_full_size_whatever_the_stages_w
     with torch.no_grad():
         images = torch.tensor(coarse.images())
         target = torch.tensor(problem.targets[0].image[None])
-        expected = problem.loss(images, target, torch.ones(images.shape[:3]), coarse.setting.unit)
+        expected = problem.loss(images, target, torch.ones(images.shape[:3]), coarse.context.unit)
     assert Report(coarse).loss_after == pytest.approx(float(expected), rel=1e-5)
 
 

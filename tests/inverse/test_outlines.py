@@ -50,9 +50,9 @@ def test_distances_are_those_from_the_edge():
 
 def test_gradients_of_pose_and_offset_are_those_of_differences(outline):
     problem = Problem(scene(), target(outline), [Pose(0, stands_on=1, resting="given"), OutlineOffset()])
-    setting = problem.setting(torch.device("cpu"))
-    model = Model(problem, setting, Stage(compares="outlines"))
-    values = problem.start(setting)
+    context = problem.context(torch.device("cpu"))
+    model = Model(problem, context, Stage(compares="outlines"))
+    values = problem.start(context)
     values["pose[0]"]["shift"] += torch.tensor([0.04, -0.03])
     values["outline_offset"]["offset"] += 0.3  # at 0, pixels beside the edge have a derivative to one side
     tensors = [values["pose[0]"]["shift"], values["outline_offset"]["offset"]]

@@ -47,8 +47,8 @@ def result_of(free, seed: int = 0, **target) -> Result:
     image = ws.render(where)[..., :3]
     image = image + NOISE * np.random.default_rng(seed).standard_normal(image.shape)
     problem = Problem(where, Target(image.astype(np.float32), **target), free, still=None)
-    setting = problem.setting(torch.device("cpu"))
-    return Result(problem, setting, problem.start(setting), [[]], "converged", math.nan)
+    context = problem.context(torch.device("cpu"))
+    return Result(problem, context, problem.start(context), [[]], "converged", math.nan)
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_a_free_light_leaves_less_curvature_to_a_pose():
     forms = []
     for free in ([Pose(0)], [Pose(0), Light(2)]):
         result = result_of(free)
-        forms.append(NormalMatrix(result.problem, result.setting, result.values).normal_matrix)
+        forms.append(NormalMatrix(result.problem, result.context, result.values).normal_matrix)
     assert np.linalg.eigvalsh(forms[0] - forms[1]).min() > -0.02 * np.linalg.eigvalsh(forms[0]).max()
     assert np.trace(forms[1]) < 0.99 * np.trace(forms[0])
     assert 0 < result_of([Pose(0), Light(2)]).uncertainty.light < 0.2
@@ -103,13 +103,13 @@ def test_a_free_light_leaves_less_curvature_to_a_pose():
 def test_starts_lie_along_the_direction_that_is_known_least(outline, pose, rotation):
     pose = dataclasses.replace(pose, rotation=rotation)
     result = result_of([pose, OutlineOffset()], outlines={"egg": outline}, mask=np.eye(48, 64))
-    starts = candidates_along_flat_direction(result.problem, result.setting, result.values, 4)
-    (free, _), setting, moves = result.problem.free, result.setting, []
-    first, origin, _ = free.moved(result.values[free.name], setting)
+    starts = candidates_along_flat_direction(result.problem, result.context, result.values, 4)
+    (free, _), context, moves = result.problem.free, result.context, []
+    first, origin, _ = free.moved(result.values[free.name], context)
     for start in starts:
-        turned, middle, _ = free.moved(start[free.name], setting)
+        turned, middle, _ = free.moved(start[free.name], context)
         turn = Rotation.from_matrix((turned @ first.T).numpy()).as_rotvec()
-        moves.append(np.concatenate([turn, (middle - origin).numpy() / setting.extent(0)]))
+        moves.append(np.concatenate([turn, (middle - origin).numpy() / context.extent(0)]))
     np.testing.assert_allclose(np.linalg.norm(moves, axis=1), CANDIDATE_SPACING * np.array([1, 1, 2, 2]), rtol=1e-2)
     np.testing.assert_allclose(moves[0], -moves[1], atol=1e-2 * CANDIDATE_SPACING)
 
@@ -145,10 +145,10 @@ def test_its_residuals_have_the_gradient_of_the_loss(kind, reduction):
     target = Target(ws.render(where) * np.array([0.8, 0.9, 1.1, 0.9], np.float32))
     loss = Loss(kind, delta=0.3, coverage=0.5, reduction=reduction)
     problem = Problem(where, target, [Exposure(), Pose(0, scale=True)], loss, still=None)
-    setting = problem.setting(torch.device("cpu"))
-    values = problem.start(setting)
+    context = problem.context(torch.device("cpu"))
+    values = problem.start(context)
     values["pose[0]"]["log_scale"] += 0.1
-    normal, model = NormalMatrix(problem, setting, values), Model(problem, setting, small_stage(problem))
+    normal, model = NormalMatrix(problem, context, values), Model(problem, context, small_stage(problem))
     slopes = []
     for name, key, number in normal.parameter_entries:
         ends = []

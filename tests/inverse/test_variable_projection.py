@@ -37,8 +37,8 @@ def prepared(loss: Loss | None = None, free=None, **target):
     where = scene()
     image = ws.Renderer(where).render()[..., :3]
     problem = Problem(where, Target(np.asarray(image), **target), free or [CELLS, Pose(0)], loss or Loss(), still=None)
-    setting = problem.setting(CPU)
-    return problem, setting, problem.start(setting)
+    context = problem.context(CPU)
+    return problem, context, problem.start(context)
 
 
 def test_the_least_squares_are_those_of_the_matrix():
@@ -54,12 +54,12 @@ def test_the_least_squares_are_those_of_the_matrix():
 
 @pytest.mark.parametrize("loss", [Loss(), Loss("huber"), Loss("geman-mcclure", 0.3)], ids=lambda loss: loss.kind)
 def test_no_light_beside_the_solution_has_a_lower_loss(loss):
-    problem, setting, values = prepared(loss)
+    problem, context, values = prepared(loss)
     target = problem.targets[0].image
     target[5:12, 4:9] += 2.0  # that no light explains
-    model = ProjectedModel(problem, setting, SOLVED)
+    model = ProjectedModel(problem, context, SOLVED)
     least = float(model.loss(values)[0])
-    plain, solution = Model(problem, setting, Stage()), values["light"]["log_radiance"].clone()
+    plain, solution = Model(problem, context, Stage()), values["light"]["log_radiance"].clone()
     for seed in range(4):
         noise = torch.randn(solution.shape, generator=torch.Generator().manual_seed(seed))
         values["light"]["log_radiance"] = solution + 0.3 * noise
@@ -68,8 +68,8 @@ def test_no_light_beside_the_solution_has_a_lower_loss(loss):
 
 @pytest.mark.parametrize("loss", [Loss(), Loss("huber")], ids=lambda loss: loss.kind)
 def test_the_gradient_is_that_of_the_loss_at_the_best_light(loss):
-    problem, setting, values = prepared(loss, [CELLS, Pose(0, stands_on=1, resting="given")])
-    model = ProjectedModel(problem, setting, SOLVED)
+    problem, context, values = prepared(loss, [CELLS, Pose(0, stands_on=1, resting="given")])
+    model = ProjectedModel(problem, context, SOLVED)
     values["pose[0]"]["shift"] += torch.tensor([0.05, -0.04])
     shift = values["pose[0]"]["shift"].requires_grad_()
     model.loss(values)[0].backward()
@@ -85,10 +85,10 @@ def test_the_gradient_is_that_of_the_loss_at_the_best_light(loss):
 
 
 def test_light_in_harmonics_is_the_projection_of_one_that_is_nowhere_negative():
-    problem, setting, values = prepared(free=[Light(4), Pose(0)])
+    problem, context, values = prepared(free=[Light(4), Pose(0)])
     with torch.no_grad():
-        before = float(Model(problem, setting, Stage()).loss(values)[0])
-    model = ProjectedModel(problem, setting, SOLVED)
+        before = float(Model(problem, context, Stage()).loss(values)[0])
+    model = ProjectedModel(problem, context, SOLVED)
     loss, _ = model.loss(values)
     assert float(loss.detach()) < before
     assert model.solution.min() >= 0
@@ -99,14 +99,14 @@ def test_light_in_harmonics_is_the_projection_of_one_that_is_nowhere_negative():
 
 
 def test_saturated_pixels_are_a_lower_bound_of_the_light():
-    problem, setting, _ = prepared()
+    problem, context, _ = prepared()
     image = problem.targets[0].image
     clipped = np.minimum(image / (0.6 * image.max()), 1)
     totals = []
     for target in (Target(clipped, saturation=1.0), Target(clipped)):
         one_problem = dataclasses.replace(problem, targets=[target])
-        own = one_problem.start(setting)
-        ProjectedModel(one_problem, setting, SOLVED).loss(own)
+        own = one_problem.start(context)
+        ProjectedModel(one_problem, context, SOLVED).loss(own)
         totals.append(float(own["light"]["log_radiance"].exp().sum()))
     assert totals[0] > totals[1] * 1.02
 
@@ -123,7 +123,7 @@ def test_a_pose_is_found_beside_a_light_and_a_color_that_are_unknown():
     assert np.linalg.norm(away) < SIXTH_OF_A_PIXEL
     np.testing.assert_allclose(result.scene.bodies[0].albedo, truth.bodies[0].albedo, rtol=0.3)
     with torch.no_grad():  # the light that is returned is that of the pose that is returned
-        best = float(Model(problem, result.setting, Stage()).loss(result.values)[0])
+        best = float(Model(problem, result.context, Stage()).loss(result.values)[0])
     assert best <= min(result.losses[-1]) * 1.001
 
 
@@ -133,5 +133,5 @@ def test_a_stage_that_solves_for_light_needs_a_free_one_and_another_parameter():
     for stages in ([SOLVED], "photograph"):
         with pytest.raises(ValueError, match=r"stages\[0\]: got solves_light where light alone is free, exp"):
             fit(Problem(scene(), Target(np.ones((30, 40, 3))), CELLS), stages)
-    problem, setting, _ = prepared()
-    assert isinstance(make_model(problem, setting, SOLVED), ProjectedModel)
+    problem, context, _ = prepared()
+    assert isinstance(make_model(problem, context, SOLVED), ProjectedModel)

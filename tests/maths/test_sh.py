@@ -175,7 +175,7 @@ def test_rotating_coefficients_rotates_the_function(seed, order):
     rotation = twins.random_rotation(seed)
     coefficients = np.random.default_rng(seed).normal(size=order**2)
     directions = unit_vectors(seed, 30)
-    turned = sh.rotation_matrix(order, rotation) @ coefficients
+    turned = sh.harmonic_rotation(order, rotation) @ coefficients
     difference = (
         twins.harmonics(order, directions @ rotation.T) @ turned - twins.harmonics(order, directions) @ coefficients
     )
@@ -186,12 +186,12 @@ def test_rotating_coefficients_rotates_the_function(seed, order):
 @given(seed=seeds, order=st.sampled_from(ORDERS))
 def test_rotation_matrices_are_orthogonal_block_diagonal_and_compose(seed, order):
     first, second = twins.random_rotation(seed), twins.random_rotation(seed + 1)
-    matrix = sh.rotation_matrix(order, first)
+    matrix = sh.harmonic_rotation(order, first)
     band = sh.band_of(order)
     assert np.abs(matrix @ matrix.T - np.eye(order**2)).max() < EXACT
     assert np.abs(matrix[band[:, None] != band]).max() < EXACT
-    both = sh.rotation_matrix(order, second @ first)
-    assert np.abs(sh.rotation_matrix(order, second) @ matrix - both).max() < EXACT
+    both = sh.harmonic_rotation(order, second @ first)
+    assert np.abs(sh.harmonic_rotation(order, second) @ matrix - both).max() < EXACT
 
 
 @settings(max_examples=15, deadline=None)
@@ -201,7 +201,7 @@ def test_turning_a_zonal_vector_is_the_full_rotation_of_it(seed, order):
     zonal = np.random.default_rng(seed).normal(size=order)
     upright = np.zeros(order**2)
     upright[[band**2 + band for band in range(order)]] = zonal
-    expected = sh.rotation_matrix(order, rotation) @ upright
+    expected = sh.harmonic_rotation(order, rotation) @ upright
     assert np.abs(twins.turned(zonal, rotation[:, 2]) - expected).max() < 10 * EXACT
 
 

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from warpshadow.assets.harmonic_light import HarmonicLight
-from warpshadow.device.constants import collected
+from warpshadow.device.constants import collecting_constants
 from warpshadow.device.tape import recorded
 from warpshadow.pipeline.explain import Explanation, decide_which_nodes_run
 from warpshadow.pipeline.node import Call, Clock, ExplainRow, Input, Node, detached
@@ -145,7 +145,7 @@ def test_values_that_were_there_before_are_noted_while_they_are_collected(clock)
     source = Input("vertices", array())
     node, other = Node("first", lambda given: [given], source), Node("second", type, source, caches=False)
     value = node.value(Call(clock))
-    with collected() as held:
+    with collecting_constants() as held:
         node.value(Call(clock))
         other.value(Call(clock))
     assert [item is expected for item, expected in zip(held, (value, source.value()), strict=True)] == [True, True]
@@ -180,7 +180,7 @@ def wired(vertices=2, cameras=3, **options):
     normals = Node("normals", lambda a: 1, vertices)
     sides = Node("sides", lambda clip: clip, clip, idle="every body is closed")
     image = Node("image", lambda *given: sum(given), sides, detached(silhouettes), normals, caches=False)
-    return image, {node.stage.name: node for node in (clip, silhouettes, normals, sides, image)}
+    return image, {node.row.name: node for node in (clip, silhouettes, normals, sides, image)}
 
 
 def test_each_node_says_why_it_runs_or_does_not(clock):
@@ -232,7 +232,7 @@ def test_a_detached_input_matters_and_gets_no_gradient(clock):
     inputs = (detached(vertices, is_constant=is_constant) for is_constant in (False, True))
     fixed, constant = (Node("node", None, each) for each in inputs)
     assert fixed.requires_grad and not fixed.differentiated_inputs and list(fixed.root_inputs) == [vertices]
-    assert not constant.requires_grad and not constant.root_inputs and not constant.before[0].before
+    assert not constant.requires_grad and not constant.root_inputs and not constant.dependencies[0].dependencies
 
 
 # ---------------------------------------------------------------------------------------------- times
@@ -243,7 +243,7 @@ def test_parts_of_a_stage_and_of_its_adjoint_are_timed_together(clock, monkeypat
     ticks = itertools.count()
     monkeypatch.setattr(clock, "now", lambda: next(ticks))
     stage = ExplainRow("transfer")
-    node = Node("", None, Input("vertices", array(requires_grad=True)), stages=(stage,))
+    node = Node("", None, Input("vertices", array(requires_grad=True)), rows=(stage,))
     with recorded() as tape:
         call = Call(clock)
         for _ in range(3):

@@ -16,7 +16,7 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.methods import directional
 from warpshadow.pipeline.receivers import groups
-from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
+from warpshadow.pipeline.receivers.choice_of_receivers import for_still
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.tuning.point_sample import PointSample
 
@@ -206,7 +206,7 @@ def test_a_scene_turned_with_its_light_and_camera_gives_the_same_image(device, m
         dataclasses.replace(body, rotation=(20, 50, -30), translation=turn @ body.translation) for body in scene.bodies
     ]
     camera = dataclasses.replace(CAMERA, rotation=CAMERA.rotation @ turn.T)
-    turned = scene_of(method, *bodies, light=sh.rotation_matrix(4, turn) @ light, camera=camera)
+    turned = scene_of(method, *bodies, light=sh.harmonic_rotation(4, turn) @ light, camera=camera)
     image, expected = ws.render(turned, device=device), ws.render(scene, device=device)
     agrees = np.abs(image - expected)[..., 3] < FLOAT32  # at silhouettes a sample may flip
     assert agrees.mean() > 0.98
@@ -576,9 +576,9 @@ def test_in_a_picture_shadows_end_sharply_on_a_coarse_ground():
 
 def test_in_a_picture_only_flat_bodies_that_leave_it_open_are_shaded_by_pixel():
     bodies = ball(), ground(12, receivers="auto"), ground(12)
-    scene = for_picture(scene_of("directional", *bodies))
+    scene = for_still(scene_of("directional", *bodies))
     assert [body.receivers for body in scene.bodies] == ["auto", "pixel", "vertex"]
-    assert for_picture(scene) is scene
+    assert for_still(scene) is scene
 
 
 def test_what_moves_does_not_change_the_choice_and_a_copy_makes_the_same():

@@ -4,9 +4,9 @@ import itertools
 
 import pytest
 
-from warpshadow.pipeline.transport import Bouncing, choose_bouncing
+from warpshadow.pipeline.transport import BounceSolver, choose_bounce_solver
 
-PATHS, STATIC, MOVING = Bouncing.PATHS, Bouncing.STATIC, Bouncing.MOVING
+PATHS, STATIC, MOVING = BounceSolver.PATHS, BounceSolver.STATIC, BounceSolver.MOVING
 
 # light is free, reflectance is given, bodies and cameras are the scene's: by spheres, by rays
 TABLE = {
@@ -25,7 +25,7 @@ TABLE = {
 def test_each_combination_of_inputs_has_the_bounces_of_its_row(facts):
     inputs = dict(zip(("is_free", "is_given", "is_of_scene"), facts, strict=True))
     by_spheres, by_rays = (
-        choose_bouncing(**inputs, has_spheres=stand_in, shares_directions=False) for stand_in in (True, False)
+        choose_bounce_solver(**inputs, has_spheres=stand_in, shares_directions=False) for stand_in in (True, False)
     )
     assert (by_spheres, by_rays) == TABLE[facts]
-    assert choose_bouncing(**inputs, has_spheres=False, shares_directions=True) is STATIC
+    assert choose_bounce_solver(**inputs, has_spheres=False, shares_directions=True) is STATIC

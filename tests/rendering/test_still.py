@@ -8,7 +8,7 @@ import trimesh
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
+from warpshadow.pipeline.receivers.choice_of_receivers import for_still
 from warpshadow.scene.visibility import SHARED_DIRECTIONS
 from warpshadow.spheres import Spheres
 from warpshadow.stages.light.light_samples import cut_map
@@ -179,11 +179,11 @@ def test_a_still_does_not_depend_on_what_the_cache_holds():
 
 def test_a_method_that_is_named_is_obeyed():
     named = scene(16, visibility=ws.Visibility("directional"))
-    assert for_picture(named).visibility.method == "directional"
+    assert for_still(named).visibility.method == "directional"
     kept = ws.Renderer(scene(16)).render()
     np.testing.assert_array_equal(ws.Renderer(named).render(), kept)
     by_rays = scene(16, visibility=ws.Visibility("ray-traced", samples=64))
-    assert for_picture(by_rays).visibility is by_rays.visibility
+    assert for_still(by_rays).visibility is by_rays.visibility
 
 
 @pytest.mark.parametrize("setting", [{"directions": 64}, {"softness": 0.5}, {"self_shadows": "spheres"}])
@@ -196,16 +196,16 @@ def test_settings_that_both_read_name_nothing():
     for count in (64, 1024):
         visibility = dataclasses.replace(ws.Visibility(), samples=count)
         assert visibility.method is None
-        still = for_picture(scene(16, visibility=visibility)).visibility
+        still = for_still(scene(16, visibility=visibility)).visibility
         assert (still.ray_count, still.sampling) == (count, "shared")
-    assert for_picture(scene(16)).visibility.ray_count == SHARED_DIRECTIONS
+    assert for_still(scene(16)).visibility.ray_count == SHARED_DIRECTIONS
 
 
 @pytest.mark.parametrize("own", [{"self_shadows": "spheres"}, {"blockers": Spheres([[0, 0, 0]], [1.0])}])
 def test_what_a_body_says_of_its_spheres_names_directional(own):
     given = scene(16)
     bodies = (dataclasses.replace(given.bodies[0], **own), given.bodies[1])
-    assert for_picture(dataclasses.replace(given, bodies=bodies)).visibility.method == "directional"
+    assert for_still(dataclasses.replace(given, bodies=bodies)).visibility.method == "directional"
 
 
 def test_a_scene_that_names_no_method_reads_back_so(tmp_path):

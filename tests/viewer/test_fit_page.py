@@ -184,7 +184,7 @@ def test_what_is_stopped_has_the_best_values_so_far(viewer, page):
     result = running.ended()
     color = result.values["albedo[0]"]["color"]
     with torch.no_grad():
-        model = inverse.model.Model(problem(), result.setting, inverse.Stage())
+        model = inverse.model.Model(problem(), result.context, inverse.Stage())
         loss = float(model.loss(result.values)[0])
     assert loss <= min(result.losses[0]) < result.losses[0][0] and torch.isfinite(color).all()
 

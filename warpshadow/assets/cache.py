@@ -117,7 +117,7 @@ def load_or_compute(
         if not path.exists():
             with contextlib.suppress(OSError):  # of a folder that cannot be written to
                 path.parent.mkdir(parents=True, exist_ok=True)
-                lock_stack.enter_context(files.locked(path))
+                lock_stack.enter_context(files.file_lock(path))
         if path.exists():
             try:
                 with path.open("rb") as file, np.load(file, allow_pickle=False) as cached_arrays:

@@ -42,7 +42,7 @@ def atomic_write(path: AnyPath) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def locked(path: Path, *, timeout: float = -1, busy: Exception | None = None) -> Iterator[None]:
+def file_lock(path: Path, *, timeout: float = -1, busy: Exception | None = None) -> Iterator[None]:
     """Lock a file against others that want to hold it, in this process or another; the lock ends with the process.
 
     Args:

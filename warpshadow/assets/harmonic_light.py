@@ -67,7 +67,7 @@ class HarmonicLight:
         from scipy.spatial.transform import Rotation
 
         about_y = Rotation.from_rotvec([0, degrees, 0], degrees=True).as_matrix()
-        return HarmonicLight(sh.rotation_matrix(sh.order_of("light", self.coefficients), about_y) @ self.coefficients)
+        return HarmonicLight(sh.harmonic_rotation(sh.order_of("light", self.coefficients), about_y) @ self.coefficients)
 
     def scaled(self, factor: float) -> HarmonicLight:
         """Multiply the radiance by a factor."""

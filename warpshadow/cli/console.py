@@ -13,7 +13,9 @@ import warp as wp
 from warpshadow import __version__, check, quiet
 from warpshadow.assets import files
 
-_ELSEWHERE = {"explain": "in Python, Renderer(scene).explain() lists the stages of an image, and which are cached"}
+_COMMAND_REMEDIES = {
+    "explain": "in Python, Renderer(scene).explain() lists the stages of an image, and which are cached"
+}
 """Remedies for commands that there are not."""
 
 
@@ -22,8 +24,8 @@ class _Commands(typer.core.TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command of a command line."""
-        if args and args[0] in _ELSEWHERE:
-            ctx.fail(f"No such command '{args[0]}': {_ELSEWHERE[args[0]]}.")
+        if args and args[0] in _COMMAND_REMEDIES:
+            ctx.fail(f"No such command '{args[0]}': {_COMMAND_REMEDIES[args[0]]}.")
         return super().resolve_command(ctx, args)
 
 

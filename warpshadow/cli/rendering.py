@@ -124,7 +124,7 @@ def render(
 ) -> None:
     """Render a scene file, or a mesh on a ground under a sky, to an image with soft shadows."""
     from warpshadow.assets.image import write_image
-    from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
+    from warpshadow.pipeline.receivers.choice_of_receivers import for_still
     from warpshadow.pipeline.renderer import SceneRenderer
     from warpshadow.scene.camera_path import CameraPath
     from warpshadow.tuning.tune import describe, resolved
@@ -162,7 +162,7 @@ def render(
         if parsed_scene.visibility.method == AUTO:
             loaded_scene = resolved(parsed_scene, device=warp_device, progress=True)
             note(f"auto: {describe(loaded_scene)}", is_quiet)
-        loaded_scene = for_picture(loaded_scene if video is None or stills else loaded_scene.with_method())
+        loaded_scene = for_still(loaded_scene if video is None or stills else loaded_scene.with_method())
         start = time.perf_counter()
         if video is not None:
             cameras = (

@@ -70,7 +70,7 @@ def write_shards(
     folder.mkdir(parents=True, exist_ok=True)
     shards = shards_of(data_set)
     busy = FileExistsError(f"{folder}: another process writes into this folder")
-    with files.locked(folder / INDEX, timeout=0, busy=busy):
+    with files.file_lock(folder / INDEX, timeout=0, busy=busy):
         _prepare_folder(folder, describe(data_set))
         missing_shards = [shard for shard in shards if not (folder / shard.name).exists()]
         numbers = [number for shard in missing_shards for number in shard.numbers]

@@ -20,7 +20,7 @@ _immutable: "weakref.WeakValueDictionary[int, np.ndarray]" = weakref.WeakValueDi
 
 
 @contextlib.contextmanager
-def collected() -> Iterator[list[Any]]:
+def collecting_constants() -> Iterator[list[Any]]:
     """Collect the constants and cached values that are used meanwhile.
 
     Whoever reads them later, as a graph does, must hold them: caches let them go.
@@ -46,13 +46,13 @@ def cached_by_values(function: Callable[P, R]) -> Callable[P, R]:
         key = tuple(map(_key, args))
         cached_result = results.get(key)
         if cached_result is None:
-            with collected() as arrays:
+            with collecting_constants() as arrays:
                 cached_result = function(*args), arrays  # type: ignore[call-arg]
             while len(results) >= _MAX_RESULTS:
                 results.pop(next(iter(results)), None)
             results[key] = cached_result
         elif _collections:
-            use(*cached_result[1])
+            note_use(*cached_result[1])
         return cached_result[0]
 
     return cached
@@ -65,7 +65,7 @@ def immutable(values: np.ndarray) -> np.ndarray:
     return values
 
 
-class Identity:
+class IdentityKey:
     """A key that equals those of the same object only, which it holds."""
 
     __slots__ = ("_value",)
@@ -77,18 +77,18 @@ class Identity:
         return id(self._value)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Identity) and self._value is other._value
+        return isinstance(other, IdentityKey) and self._value is other._value
 
 
 def _key(value: Any) -> Hashable:
     if isinstance(value, np.ndarray):
         if _immutable.get(id(value)) is value:
-            return Identity(value)
+            return IdentityKey(value)
         return value.tobytes(), value.dtype.str, value.shape
     return str(value) if isinstance(value, wp.Device) else value
 
 
-def use(*values: Any) -> None:
+def note_use(*values: Any) -> None:
     """Note that constants or cached values are used: arrays, or objects that hold some."""
     for collection in list(_collections.values()):
         collection.extend(values)
@@ -116,5 +116,5 @@ def constant(values: np.ndarray, dtype: type, device: wp.DeviceLike) -> wp.array
     if wp.get_device(device).is_capturing:
         raise RuntimeError("a graph is captured that needs new constants: call the function once before its capture")
     array = wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-    use(array)
+    note_use(array)
     return array

@@ -23,7 +23,7 @@ from typing import Any, Generic, TypeVar
 
 import warp as wp
 
-from warpshadow.device.constants import collected
+from warpshadow.device.constants import collecting_constants
 from warpshadow.device.tape import recorded
 from warpshadow.device.threads import locked
 
@@ -78,7 +78,7 @@ class Captured(Generic[Result]):
         """The graph, the result that it writes, and the constants and cached values that it reads."""
         if self._device.is_cuda and not wp.is_mempool_enabled(self._device):
             raise RuntimeError(f"{self._device}: a capture that allocates needs wp.set_mempool_enabled")
-        with collected() as cached_values, wp.ScopedCapture(device=self._device) as capture:
+        with collecting_constants() as cached_values, wp.ScopedCapture(device=self._device) as capture:
             result = self._function()
         return capture.graph, result, cached_values
 

@@ -101,7 +101,7 @@ class Wait:
         self.remark = ""
         self.bar: Any = None  # tqdm's, where it shows one
         self._start = time.monotonic()
-        self._before, self._label_start = done, self._start  # of the work that the label names
+        self._done_at_start, self._label_start = done, self._start  # of the work that the label names
 
     @property
     def age(self) -> float:
@@ -128,7 +128,7 @@ class Wait:
     def describe(self, label: str, remark: str = "") -> None:
         """Label the bar, from its next update, with the work under way, which has a pace of its own, and a remark."""
         if label != self.label:
-            self._before, self._label_start = self.done, time.monotonic()
+            self._done_at_start, self._label_start = self.done, time.monotonic()
         self.label, self.remark = label, remark
         if self.bar is not None:
             self.bar.set_description_str(label, refresh=False)
@@ -139,9 +139,9 @@ class Wait:
         parts = [show_time(self.age)]
         if self.unit and self.total is not None:
             parts.insert(0, f"{self.done:,} of {self.total:,} {self.unit}s")
-            if self.done > self._before:
+            if self.done > self._done_at_start:
                 age = time.monotonic() - self._label_start
-                left = age * max(self.total - self.done, 0) / (self.done - self._before)
+                left = age * max(self.total - self.done, 0) / (self.done - self._done_at_start)
                 parts.append(f"{show_time(left)} left")
         if self.remark:
             parts.append(self.remark)

@@ -13,7 +13,7 @@ import warp as wp
 
 from warpshadow.device import warp_internals
 from warpshadow.device.memory import ZeroedMemory
-from warpshadow.device.warp_internals import current_tape, own_tape, verify_access
+from warpshadow.device.warp_internals import current_tape, thread_tape, verify_access
 
 
 class Recording(wp.Tape):
@@ -28,7 +28,7 @@ class Recording(wp.Tape):
 def recorded() -> Iterator[wp.Tape]:
     """Record this thread's launches on a tape of their own, whatever tape is open around them or in other threads."""
     tape = Recording()
-    with own_tape(tape):
+    with thread_tape(tape):
         yield tape
     tape.memory.end()
 
@@ -36,7 +36,7 @@ def recorded() -> Iterator[wp.Tape]:
 @contextlib.contextmanager
 def unrecorded() -> Iterator[None]:
     """Record nothing that this thread launches."""
-    with own_tape(None):
+    with thread_tape(None):
         yield
 
 

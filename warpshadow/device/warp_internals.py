@@ -50,7 +50,7 @@ def current_tape() -> wp.Tape | None:
 
 
 @contextlib.contextmanager
-def own_tape(tape: wp.Tape | None) -> Iterator[None]:
+def thread_tape(tape: wp.Tape | None) -> Iterator[None]:
     """Record this thread's launches on a tape that other threads do not see; None for no recording."""
     thread_tapes = _Runtime.tape.own
     thread_tapes.append(tape)
@@ -64,10 +64,10 @@ if "inline" not in inspect.signature(wp.func).parameters:  # Warp 1.17, whose co
     _func = wp.func
 
     @functools.wraps(_func)
-    def _decide_on_its_own(*arguments: Any, inline: bool | None = None, **options: Any) -> Any:
+    def _func_without_inline(*arguments: Any, inline: bool | None = None, **options: Any) -> Any:
         return _func(*arguments, **options)
 
-    wp.func = _decide_on_its_own
+    wp.func = _func_without_inline
 
 _context, _types = wp._src.context, wp._src.types
 

@@ -46,12 +46,12 @@ class _Worker(Generic[Task, Result]):
         self.process = context.Process(target=_serve, args=(other_end, function, threads), daemon=True)
         self.process.start()
         other_end.close()  # so that its death is the end of the connection
-        self.has: tuple[Task, int] | None = None
+        self.assignment: tuple[Task, int] | None = None
         self.has_started = False
 
     def begin(self, task: Task, packed_task: bytes, attempt: int) -> None:
         """Let it do a task; should it be dead, that is noticed as if it died of the task."""
-        self.has = task, attempt
+        self.assignment = task, attempt
         with contextlib.suppress(OSError):
             self.connection.send_bytes(packed_task)
 
@@ -108,8 +108,8 @@ def run_tasks(
                 return
             for connection in wait([worker.connection for worker in busy.values()]):
                 worker = busy.pop(connection)
-                assert worker.has is not None
-                task, attempt = worker.has
+                assert worker.assignment is not None
+                task, attempt = worker.assignment
                 try:
                     packed_result = worker.connection.recv_bytes()
                     if not worker.has_started:  # the first that it says

@@ -39,7 +39,7 @@ def exclusive(path: AnyPath | None) -> contextlib.AbstractContextManager[None]:
     if path is None:
         return contextlib.nullcontext()
     busy = CheckpointError(f"{path}: another fit is writing it; wait for its end, or {OTHER_FILE_REMEDY}")
-    return files.locked(Path(path), timeout=0, busy=busy)
+    return files.file_lock(Path(path), timeout=0, busy=busy)
 
 
 def save(path: AnyPath, state: Mapping[str, object]) -> None:

@@ -80,10 +80,10 @@ class _Descent:
     ):
         self.problem, self.stages, self.make_optimizer, self.tolerance = problem, stages, optimizer, tolerance
         self.seed = seed
-        self.setting = problem.setting(device, progress=progress)
+        self.context = problem.context(device, progress=progress)
         self.stage = 0
         self.is_found = False
-        self.candidates = self._candidates_of_stage([_Candidate(problem.start(self.setting), None)])
+        self.candidates = self._candidates_of_stage([_Candidate(problem.start(self.context), None)])
         self.ended: list[_FinishedRun] = []
         self.losses: list[list[float]] = []
         self.descents: list[int] = []
@@ -113,7 +113,7 @@ class _Descent:
     def _perturbed_candidates(self, values: Mapping[str, Values], count: int) -> list[dict[str, Values]]:
         scatter = self.stages[self.stage].scatter
         if count > 0 and scatter == "flat":
-            return candidates_along_flat_direction(self.problem, self.setting, values, count)
+            return candidates_along_flat_direction(self.problem, self.context, values, count)
         if scatter == "lamps":
             return [self._relocated(values, number) for number in range(count)]
         generator = torch.Generator().manual_seed(self.seed)
@@ -126,11 +126,11 @@ class _Descent:
         """Values with free lamps elsewhere."""
         lamps = {lamp.name: lamp for lamp in self.problem.free_of(Lamp)}
         copies = _copy_values(values)
-        return copies | {name: lamp.relocated(copies[name], self.setting, number) for name, lamp in lamps.items()}
+        return copies | {name: lamp.relocated(copies[name], self.context, number) for name, lamp in lamps.items()}
 
     def begin_stage(self) -> None:
         """Set up the model of a stage, and its first candidate."""
-        self.model = make_model(self.problem, self.setting, self.stages[self.stage])
+        self.model = make_model(self.problem, self.context, self.stages[self.stage])
         self.images: torch.Tensor | None = None  # of the last iteration, if it took any
         self._begin_run(self.candidates[0])
         self.losses.append([])
@@ -181,7 +181,7 @@ class _Descent:
                 f"checkpoint: got one {of_other}, expected one of this fit; "
                 f"{checkpoints.OTHER_FILE_REMEDY}, or remove it"
             )
-        device = self.setting.device
+        device = self.context.device
         self.stage = state["stage"]
         self.candidates = [_Candidate(_copy_values(values, device), *fields) for values, *fields in state["candidates"]]
         self.is_found = state["is_found"]
@@ -427,8 +427,8 @@ def fit(
     seconds = statistics.median(durations) if durations else math.nan
     values = descent.best if descent.reason else descent.best_so_far()
     if reason in GOOD_ENDINGS and durations:  # not of one that had ended before
-        warn_of(problem, descent.setting, values, descent.stages[-1], descent.losses[-1], reason)
-    return Result(problem, descent.setting, values, descent.losses, reason, seconds)
+        warn_of(problem, descent.context, values, descent.stages[-1], descent.losses[-1], reason)
+    return Result(problem, descent.context, values, descent.losses, reason, seconds)
 
 
 def _descend(

@@ -19,7 +19,7 @@ from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
-from warpshadow.inverse.world import Setting
+from warpshadow.inverse.world import FitContext
 from warpshadow.scene.remarks import is_out_of_frame
 
 MAX_UNSEEN_SHARE = 0.01  # share of the counted pixels that may see no body without a warning
@@ -91,12 +91,12 @@ def gain_of_last(losses: Sequence[float]) -> float:
 
 
 def warn_of(
-    problem: Problem, setting: Setting, values: Mapping[str, Values], stage: Stage, losses: Sequence[float], end: str
+    problem: Problem, context: FitContext, values: Mapping[str, Values], stage: Stage, losses: Sequence[float], end: str
 ) -> None:
     """Warn of reasons to doubt a result."""
     is_exposure_known = problem.basis is None and not problem.free_of(Exposure)
     has_coverage = problem.targets[0].image.shape[2] == 4
-    model = Model(problem, setting, small_stage(problem))
+    model = Model(problem, context, small_stage(problem))
     with torch.no_grad():
         images = model.images(values)
     is_doubted = not has_coverage and _warn_of_unseen(model, images)

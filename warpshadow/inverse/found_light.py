@@ -25,7 +25,7 @@ from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
-from warpshadow.inverse.world import Setting
+from warpshadow.inverse.world import FitContext
 from warpshadow.maths.directions import fibonacci
 from warpshadow.maths.sh import equirectangular_directions, pixel_solid_angles
 
@@ -82,23 +82,23 @@ class FoundLight:
 
 
 def found_light(
-    light: KnownLightArgument, problem: Problem, setting: Setting, values: Mapping[str, Values]
+    light: KnownLightArgument, problem: Problem, context: FitContext, values: Mapping[str, Values]
 ) -> FoundLight:
     """The light of a fit, and which part of it the images determine."""
     radiance = as_light(light).radiance
     pixel_directions = equirectangular_directions(len(radiance))
     cells = CellBasis(fibonacci(_CELLS)).functions(pixel_directions.reshape(-1, 3))
-    influence = cells @ influence_of_cells(problem, setting, values)
+    influence = cells @ influence_of_cells(problem, context, values)
     return FoundLight(radiance.astype(np.float32), influence.reshape(pixel_directions.shape[:2]).astype(np.float32))
 
 
-def influence_of_cells(problem: Problem, setting: Setting, values: Mapping[str, Values]) -> np.ndarray:
+def influence_of_cells(problem: Problem, context: FitContext, values: Mapping[str, Values]) -> np.ndarray:
     """Find the influence of each of 512 cells' light on the images, 1 on average, shape [cell]."""
     cells = Light(None, directions=_CELLS)
     free = [cells if isinstance(item, Light) else item for item in problem.free]
     by_cells = Problem(problem.scene, problem.targets, free, problem.loss, problem.still)
-    model = Model(by_cells, setting, small_stage(problem))
-    logs = torch.zeros(_CELLS, 3, device=setting.device, requires_grad=True)  # the derivative by them is that by light
+    model = Model(by_cells, context, small_stage(problem))
+    logs = torch.zeros(_CELLS, 3, device=context.device, requires_grad=True)  # the derivative by them is that by light
     images = model.images({**values, cells.name: {"log_radiance": logs}})
     (model.weights[..., None] * images[..., :3]).sum().backward()
     assert logs.grad is not None

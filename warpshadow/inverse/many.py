@@ -278,7 +278,7 @@ def _run_fit(job: _FitJob) -> Ending:
     check_folder(job.folder)
     job.folder.mkdir(exist_ok=True)
     busy = checkpoints.CheckpointError(f"{job.folder}: another process is writing it")
-    with files.locked(job.folder / _RECORD, timeout=_LOCK_TIMEOUT, busy=busy):
+    with files.file_lock(job.folder / _RECORD, timeout=_LOCK_TIMEOUT, busy=busy):
         result = loaded_fit.run(
             device=job.device,
             checkpoint=job.folder / CHECKPOINT,

@@ -13,7 +13,7 @@ from warpshadow.inverse.outlines import outlines_of
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.target import stack_targets
-from warpshadow.inverse.world import Setting, World
+from warpshadow.inverse.world import FitContext, World
 from warpshadow.torch import TorchRenderer
 
 _LIGHTS_AT_ONCE = 16
@@ -24,16 +24,16 @@ _SEEN_VERTICES = 0.5  # the part of all vertices that an image sees, about
 class Model:
     """Images of a problem at a stage's size, and their loss against the targets."""
 
-    def __init__(self, problem: Problem, setting: Setting, stage: Stage):
-        self.problem, self.setting, self.regularization = problem, setting, stage.regularization
-        self.cameras = tuple(camera.resized(stage.scale) for camera in setting.cameras)
+    def __init__(self, problem: Problem, context: FitContext, stage: Stage):
+        self.problem, self.context, self.regularization = problem, context, stage.regularization
+        self.cameras = tuple(camera.resized(stage.scale) for camera in context.cameras)
         self.renderer = self._make_renderer(stage)
-        self.targets, self.weights, self.saturated = stack_targets(problem.targets, stage.scale, setting.device)
-        self.outlines = outlines_of(problem.targets, setting.scene, stage.scale, setting.device)
+        self.targets, self.weights, self.saturated = stack_targets(problem.targets, stage.scale, context.device)
+        self.outlines = outlines_of(problem.targets, context.scene, stage.scale, context.device)
         self.compares_images = stage.compares == "all"
 
     def _make_renderer(self, stage: Stage) -> TorchRenderer:
-        scene = self.setting.scene
+        scene = self.context.scene
         scene = replace(
             scene,
             camera=self.cameras[0],
@@ -45,13 +45,13 @@ class Model:
         is_coarse = stage.scale < 1 and sample_count < _SEEN_VERTICES * vertex_count
         if self.problem.moves and is_coarse:  # of samples and vertices, the fewer are shaded
             scene = replace(scene, bodies=tuple(replace(body, receivers="pixel") for body in scene.bodies))
-        return TorchRenderer(scene, device=self.setting.device, basis=self.problem.image_basis, cameras=self.cameras)
+        return TorchRenderer(scene, device=self.context.device, basis=self.problem.image_basis, cameras=self.cameras)
 
     def world(self, values: Mapping[str, Values]) -> World:
         """The world with values in it."""
         world = World(self.renderer, self.cameras)
         for free in self.problem.free:
-            free.apply(values[free.name], self.setting, world)
+            free.apply(values[free.name], self.context, world)
         return world
 
     def images(self, values: Mapping[str, Values]) -> torch.Tensor:
@@ -63,24 +63,24 @@ class Model:
         width].
         """
         differences = clip_saturated(images, self.targets, self.saturated)[..., :3] - self.targets[..., :3]
-        return self.weights * self.problem.loss.confidence(differences / self.setting.unit)
+        return self.weights * self.problem.loss.confidence(differences / self.context.unit)
 
     def loss(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
         """The loss with its regularizers, and the images, if it took any. Differentiable: values."""
         total, images = self._data_loss(values)
         for free in self.problem.free:
-            regularizer = free.regularizer(values[free.name], self.setting)
+            regularizer = free.regularizer(values[free.name], self.context)
             total = total if regularizer is None else total + self.regularization * regularizer
         return total, images
 
     def _data_loss(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Return (loss of images and outlines, images)."""
         world = self.world(values)
-        total, images = torch.zeros((), device=self.setting.device), None
+        total, images = torch.zeros((), device=self.context.device), None
         if self.compares_images:
             images = world.images()
             bounded_images = clip_saturated(images, self.targets, self.saturated)
-            total = self.problem.loss(bounded_images, self.targets, self.weights, self.setting.unit)
+            total = self.problem.loss(bounded_images, self.targets, self.weights, self.context.unit)
         if self.outlines is not None:
             masks, weight = world.masks(), self.problem.loss.coverage
             total = total + weight * self.outlines.loss(masks, world.outline_offsets)
@@ -95,20 +95,20 @@ class LightModel(Model):
     Sums are float64: near the end they are small differences of large numbers.
     """
 
-    def __init__(self, problem: Problem, setting: Setting, stage: Stage):
-        super().__init__(problem, setting, stage)
+    def __init__(self, problem: Problem, context: FitContext, stage: Stage):
+        super().__init__(problem, context, stage)
         (light,) = problem.free
         assert isinstance(light, Light)
         self.light = light
-        roots = problem.loss.pixel_shares(self.weights).sqrt()[..., None] / setting.unit
+        roots = problem.loss.pixel_shares(self.weights).sqrt()[..., None] / context.unit
         with torch.no_grad():
-            black_image = self.renderer(torch.zeros(light.basis.size, 3, device=setting.device))
+            black_image = self.renderer(torch.zeros(light.basis.size, 3, device=context.device))
             emitted = black_image[..., :3].reshape(self.targets[..., :3].shape)  # black where no body emits
             images = (image[..., :3] - emitted for image in self._images_of_units())
             columns = torch.cat([(image * roots).reshape(1, -1, 3) for image in images])
             target = ((self.targets[..., :3] - emitted) * roots).reshape(-1, 3)
             covered_targets = torch.cat([self.targets[..., :3], black_image[..., 3:]], dim=-1)  # but for coverage
-            coverage = problem.loss(covered_targets, self.targets, self.weights, setting.unit).double()
+            coverage = problem.loss(covered_targets, self.targets, self.weights, context.unit).double()
         columns, target = columns.permute(2, 0, 1), target.T[..., None]  # [color, coefficient, pixel]
         self._form = torch.stack([_product(column, column.T) for column in columns])
         self._slope = torch.stack(
@@ -125,13 +125,13 @@ class LightModel(Model):
 
     def _images_of_units(self) -> list[torch.Tensor]:
         """Images by lights with one coefficient of 1 each, [view, height, width, 4]."""
-        units = torch.eye(self.light.basis.size, device=self.setting.device)[..., None].expand(-1, -1, 3).contiguous()
+        units = torch.eye(self.light.basis.size, device=self.context.device)[..., None].expand(-1, -1, 3).contiguous()
         if len(self.cameras) > 1:
             return [self.renderer(unit) for unit in units]
         return [image[None] for part in units.split(_LIGHTS_AT_ONCE) for image in self.renderer(part)]
 
     def _data_loss(self, values: Mapping[str, Values]) -> tuple[torch.Tensor, torch.Tensor | None]:
-        light = self.light.coefficients(values[self.light.name], self.setting).double().T[..., None]
+        light = self.light.coefficients(values[self.light.name], self.context).double().T[..., None]
         form = (light * (self._form @ light - 2 * self._slope)).sum()
         return (form + self._constant).float(), None
 

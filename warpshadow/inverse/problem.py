@@ -26,7 +26,7 @@ from warpshadow.inverse.free.sun import Sun
 from warpshadow.inverse.free.views import Exposure
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
-from warpshadow.inverse.world import FittedScene, Setting
+from warpshadow.inverse.world import FitContext, FittedScene
 from warpshadow.scene.blockers import blocking_planes, scene_blockers
 from warpshadow.scene.remarks import is_out_of_frame
 from warpshadow.scene.scene import Scene, change_bodies, check_scene
@@ -79,7 +79,7 @@ class Problem:
             if not items:
                 raise ValueError(f"{name}: got none, expected one or more")
             object.__setattr__(self, name, items)
-        object.__setattr__(self, "targets", tuple(self._of_images()))
+        object.__setattr__(self, "targets", tuple(self._as_targets()))
         for number, target in enumerate(self.targets):
             check.instance(f"targets[{number}]", target, Target, "a Target, as Target(image) makes it, or an image")
         for number, item in enumerate(self.free):
@@ -132,7 +132,7 @@ class Problem:
             if {Lamp(body).name, Pose(body).name} <= set(names):
                 raise ValueError(f"free: got Lamp({body}) and Pose({body}), expected one of them for a body")
 
-    def _of_images(self) -> Iterator[Target]:
+    def _as_targets(self) -> Iterator[Target]:
         for number, item in enumerate(self.targets):
             with check.located(f"targets[{number}]"):
                 image: Any = item
@@ -179,7 +179,7 @@ class Problem:
         height, width, _ = self.targets[0].image.shape
         return [target.camera or _camera_of_size(self.scene.camera, width, height) for target in self.targets]
 
-    def setting(self, device: torch.device, *, progress: bool = False) -> Setting:
+    def context(self, device: torch.device, *, progress: bool = False) -> FitContext:
         """Fit the spheres and find the units."""
         cameras = self.cameras()
         scene = replace(self.scene, camera=cameras[0], visibility=self.visibility)
@@ -192,22 +192,22 @@ class Problem:
         color = np.stack([target.image[..., :3] for target in self.targets]).astype(np.float64)
         weights = np.stack([target.weights() for target in self.targets])[..., None]
         unit = float(np.sqrt((weights * color**2).sum() / (3 * weights.sum())))
-        return Setting(scene, cameras, unit or 1.0, device)
+        return FitContext(scene, cameras, unit or 1.0, device)
 
-    def start(self, setting: Setting) -> dict[str, Values]:
+    def start(self, context: FitContext) -> dict[str, Values]:
         """The scene's values of the free parameters, by name."""
-        return {free.name: free.start(setting) for free in self.free}
+        return {free.name: free.start(context) for free in self.free}
 
-    def found(self, values: dict[str, Values], setting: Setting) -> FittedScene:
+    def fitted_scene(self, values: dict[str, Values], context: FitContext) -> FittedScene:
         """The scene with values in it, and its own visibility."""
         fitted = FittedScene(
-            replace(setting.scene, visibility=self.scene.visibility),
-            list(setting.cameras),
-            [1.0] * len(setting.cameras),
+            replace(context.scene, visibility=self.scene.visibility),
+            list(context.cameras),
+            [1.0] * len(context.cameras),
         )
         with torch.no_grad():
             for free in self.free:
-                free.export(values[free.name], setting, fitted)
+                free.export(values[free.name], context, fitted)
         return fitted
 
     def fingerprint(self) -> str:

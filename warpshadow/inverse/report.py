@@ -49,8 +49,8 @@ class Report:
     @torch_on_one_thread()
     def __init__(self, result: Result):
         self.result = result
-        model = Model(result.problem, result.setting, Stage())
-        self.loss_before, self.before = _evaluate(model, result.problem.start(result.setting))
+        model = Model(result.problem, result.context, Stage())
+        self.loss_before, self.before = _evaluate(model, result.problem.start(result.context))
         self.loss_after, self.after = _evaluate(model, result.values)
         images = torch.from_numpy(self.after).to(model.targets)
         self.pixel_weights = model.pixel_weights(images).cpu().numpy()

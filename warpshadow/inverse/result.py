@@ -15,7 +15,7 @@ from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.uncertainty import Uncertainty, uncertainty
-from warpshadow.inverse.world import FittedScene, Setting
+from warpshadow.inverse.world import FitContext, FittedScene
 from warpshadow.scene.scene import Scene
 
 
@@ -25,7 +25,7 @@ class Result:
 
     Args:
         problem: The problem that was fitted.
-        setting: Its scene at the start and its units.
+        context: Its scene at the start and its units.
         values: Free parameters by name, at the least loss of the last stage.
         losses: Loss of each iteration before its step, a list for each candidate of each stage.
         reason: Why the fit ended: "converged", "finished" (all iterations done), "stopped" (on its page), or the name
@@ -34,7 +34,7 @@ class Result:
     """
 
     problem: Problem
-    setting: Setting = field(repr=False)
+    context: FitContext = field(repr=False)
     values: dict[str, Values] = field(repr=False)
     losses: list[list[float]] = field(repr=False)
     reason: str
@@ -49,7 +49,7 @@ class Result:
     @functools.cached_property
     def found(self) -> FittedScene:
         """Scene, cameras and exposures."""
-        return self.problem.found(self.values, self.setting)
+        return self.problem.fitted_scene(self.values, self.context)
 
     @property
     def scene(self) -> Scene:
@@ -61,12 +61,12 @@ class Result:
         """The light that was found, and which directions of it the images determined; None where it was not free."""
         if self.problem.basis is None:
             return None
-        return found_light(self.scene.light, self.problem, self.setting, self.values)
+        return found_light(self.scene.light, self.problem, self.context, self.values)
 
     @functools.cached_property
     def uncertainty(self) -> Uncertainty | None:
         """Uncertainty of its few parameters, such as poses and exposures; None without any."""
-        return uncertainty(self.problem, self.setting, self.values, self.found)
+        return uncertainty(self.problem, self.context, self.values, self.found)
 
     @property
     def cameras(self) -> list[Camera]:
@@ -84,7 +84,7 @@ class Result:
 
     def images(self, values: Mapping[str, Values] | None = None) -> np.ndarray:
         """Images of the views, [view, height, width, 4], of the result or of other values."""
-        model = Model(self.problem, self.setting, Stage())
+        model = Model(self.problem, self.context, Stage())
         with torch.no_grad():
             return model.images(self.values if values is None else values).cpu().numpy()
 
@@ -95,10 +95,10 @@ class Result:
         The masks times the weights that a robust loss learned: about 0 where a redescending one, "geman-mcclure" or
         "barron", took a pixel for that of an occluder or a highlight.
         """
-        model = Model(self.problem, self.setting, Stage())
+        model = Model(self.problem, self.context, Stage())
         with torch.no_grad():
             return model.pixel_weights(model.images(self.values)).cpu().numpy()
 
     def images_at_start(self) -> np.ndarray:
         """Images of the views before the fit, [view, height, width, 4]."""
-        return self.images(self.problem.start(self.setting))
+        return self.images(self.problem.start(self.context))

@@ -26,7 +26,7 @@ from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.variable_projection import ProjectedModel
-from warpshadow.inverse.world import FittedScene, Setting
+from warpshadow.inverse.world import FitContext, FittedScene
 
 MAX_UNCERTAIN_NUMBERS = 32
 """Numbers that a parameter has at most to be among the uncertain ones; textures are taken as they are."""
@@ -110,11 +110,11 @@ class NormalMatrix:
         score_covariance: Σ g gᵀ, likewise.
     """
 
-    def __init__(self, problem: Problem, setting: Setting, values: Mapping[str, Values]):
-        self.problem, self.setting = problem, setting
+    def __init__(self, problem: Problem, context: FitContext, values: Mapping[str, Values]):
+        self.problem, self.context = problem, context
         self.values = {name: {key: t.detach().clone() for key, t in parts.items()} for name, parts in values.items()}
         stage = small_stage(problem)
-        self.model = (ProjectedModel if problem.free_of(Light) else Model)(problem, setting, stage)
+        self.model = (ProjectedModel if problem.free_of(Light) else Model)(problem, context, stage)
         self.parameter_entries = _few_number_entries(problem, self.values)
         self.directions = self._directions()
         self.roots: list[torch.Tensor] = []  # of the weights of colors, and of coverage
@@ -160,10 +160,10 @@ class NormalMatrix:
 
     def pose_of(self, free: Pose) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotation, middle in the world, and scale of a body, its plane moved."""
-        rotation, center, scale = free.moved(self.values[free.name], self.setting)
+        rotation, center, scale = free.moved(self.values[free.name], self.context)
         plane = self.plane(free)
         if plane is not None:
-            rotation, center = plane.moved(self.values[plane.name], self.setting, rotation, center)
+            rotation, center = plane.moved(self.values[plane.name], self.context, rotation, center)
         return rotation, center, scale
 
     def slopes(self, free: Pose, rows: Sequence[int]) -> np.ndarray:
@@ -190,7 +190,7 @@ class NormalMatrix:
         model, loss = self.model, self.problem.loss
         world = model.world(self.values)
         bounded_images = clip_saturated(world.images(), model.targets, model.saturated)
-        residuals = [(bounded_images[..., :3] - model.targets[..., :3]) / self.setting.unit]
+        residuals = [(bounded_images[..., :3] - model.targets[..., :3]) / self.context.unit]
         if model.targets.shape[-1] == 4:
             residuals.append(bounded_images[..., 3:] - model.targets[..., 3:])
         if not self.roots:
@@ -263,7 +263,7 @@ class NormalMatrix:
         total = torch.zeros(())
         for free in self.problem.free:
             if isinstance(free, (Pose, Plane, OutlineOffset)):
-                term = free.regularizer(leaves[free.name], self.setting)
+                term = free.regularizer(leaves[free.name], self.context)
                 total = total if term is None else total + term
         if total.requires_grad:
             total.backward()
@@ -282,12 +282,12 @@ def _by_tiles(pixels: np.ndarray) -> np.ndarray:
 
 
 def uncertainty(
-    problem: Problem, setting: Setting, values: Mapping[str, Values], fitted: FittedScene
+    problem: Problem, context: FitContext, values: Mapping[str, Values], fitted: FittedScene
 ) -> Uncertainty | None:
     """Find the uncertainty of a fit's few parameters; None without any."""
     if not _few_number_entries(problem, values):
         return None
-    normal = NormalMatrix(problem, setting, values)
+    normal = NormalMatrix(problem, context, values)
     inverse = normal.directions @ np.linalg.inv(normal.normal_matrix)
     covariance = inverse @ normal.score_covariance @ inverse.T
     poses = {pose.called(fitted): _pose_uncertainty(pose, normal, covariance) for pose in problem.free_of(Pose)}
@@ -297,18 +297,18 @@ def uncertainty(
 
 def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) -> PoseUncertainty:
     """The uncertainty of a pose in scene units and degrees."""
-    setting = normal.setting
+    context = normal.context
     plane = normal.plane(free)
     names = {free.name} if plane is None else {free.name, plane.name}
     rows = [index for index, (name, _, _) in enumerate(normal.parameter_entries) if name in names]
     _, center, scale = normal.pose_of(free)
-    half = setting.extent(free.number) * float(scale)
+    half = context.extent(free.number) * float(scale)
     slopes = normal.slopes(free, rows)
     cov = slopes @ covariance[np.ix_(rows, rows)] @ slopes.T
     units = np.array([1.0] * 3 + [half] * 3)  # a turn by a radian moves vertices about as far
     sizes, directions = np.linalg.eigh(cov * units[:, None] * units)
     weakest_direction = np.sqrt(max(sizes[-1], 0.0)) * directions[:, -1]
-    view = center.double().numpy(force=True) - setting.cameras[0].eye
+    view = center.double().numpy(force=True) - context.cameras[0].eye
     length = float(np.linalg.norm(weakest_direction[:3]))
     view_share = abs(float(weakest_direction[:3] @ view)) / (length * float(np.linalg.norm(view))) if length else 0.0
     return PoseUncertainty(
@@ -322,10 +322,10 @@ def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) 
 
 
 def candidates_along_flat_direction(
-    problem: Problem, setting: Setting, values: Mapping[str, Values], count: int
+    problem: Problem, context: FitContext, values: Mapping[str, Values], count: int
 ) -> list[dict[str, Values]]:
     """Displace values along the least determined direction of the poses, both ways, and solve for the light anew."""
-    normal = NormalMatrix(problem, setting, values)
+    normal = NormalMatrix(problem, context, values)
     poses = [index for index, (name, _, _) in enumerate(normal.parameter_entries) if name.startswith(f"{Pose.key}[")]
     weakest_direction = np.zeros(len(normal.parameter_entries))
     if poses:

@@ -25,7 +25,7 @@ from warpshadow.inverse.free.light import Light, neighboring_cells
 from warpshadow.inverse.model import LightModel, Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
-from warpshadow.inverse.world import Setting, World
+from warpshadow.inverse.world import FitContext, World
 from warpshadow.maths.directions import fibonacci
 
 _REWEIGHTINGS = 6  # of losses that are not squares
@@ -38,8 +38,8 @@ _ATOMS = 192  # cells of which light in spherical harmonics is made
 class ProjectedModel(Model):
     """A model whose light is solved for before each loss, in place, so that no optimizer holds it."""
 
-    def __init__(self, problem: Problem, setting: Setting, stage: Stage):
-        super().__init__(problem, setting, stage)
+    def __init__(self, problem: Problem, context: FitContext, stage: Stage):
+        super().__init__(problem, context, stage)
         (self.light,) = problem.free_of(Light)
         self.atoms = atoms(self.light)
         self.lamps = [emission for emission in problem.free_of(Emission) if emission.is_light]
@@ -55,19 +55,19 @@ class ProjectedModel(Model):
     def emitted(self, values: Mapping[str, Values]) -> torch.Tensor | float:
         """Images by emitters that are not solved for, [view, height, width, 3]; 0 where no body emits."""
         lamp_numbers = {lamp.number for lamp in self.lamps}
-        if not any(body.is_emitter and n not in lamp_numbers for n, body in enumerate(self.setting.scene.bodies)):
+        if not any(body.is_emitter and n not in lamp_numbers for n, body in enumerate(self.context.scene.bodies)):
             return 0.0
         return self._images_by_lights(self.world(values), self._darkness)[0]
 
     @property
     def _darkness(self) -> torch.Tensor:
-        return torch.zeros(1, self.light.basis.size, 3, device=self.setting.device)
+        return torch.zeros(1, self.light.basis.size, 3, device=self.context.device)
 
     def _images_by_lights(self, world: World, lights: torch.Tensor, shining: Emission | None = None) -> torch.Tensor:
         """Images by lights [light, coefficient, 3] and one of the solved lamps: [light, view, height, width, 3]."""
         for lamp in self.lamps:
-            radiance = torch.full((1, 3), float(lamp is shining), device=self.setting.device)
-            lamp.apply({"radiance": radiance}, self.setting, world)
+            radiance = torch.full((1, 3), float(lamp is shining), device=self.context.device)
+            lamp.apply({"radiance": radiance}, self.context, world)
         images = []
         for part in lights if len(self.cameras) > 1 else lights.split(_LIGHTS_AT_ONCE):
             world.light = part
@@ -77,7 +77,7 @@ class ProjectedModel(Model):
     def design(self, values: Mapping[str, Values], emitted: torch.Tensor | float = 0.0) -> torch.Tensor:
         """Images by single atoms and single lamps, less those by other emitters: [atom, view, height, width, 3]."""
         world = self.world(values)
-        coefficients = torch.eye(self.light.basis.size, device=self.setting.device)[..., None].expand(-1, -1, 3)
+        coefficients = torch.eye(self.light.basis.size, device=self.context.device)[..., None].expand(-1, -1, 3)
         images = self._images_by_lights(world, coefficients.contiguous()) - emitted
         images = torch.tensordot(torch.from_numpy(self.atoms).to(images), images, dims=1)
         if not self.lamps:
@@ -91,7 +91,7 @@ class ProjectedModel(Model):
         """Set light and lamps to those of the least loss, for the other values."""
         emitted = self.emitted(values)
         design = self.design(values, emitted).permute(4, 0, 1, 2, 3).flatten(2)  # [color, atom, pixel]
-        target = ((self.targets[..., :3] - emitted) / self.setting.unit).permute(3, 0, 1, 2).flatten(1)
+        target = ((self.targets[..., :3] - emitted) / self.context.unit).permute(3, 0, 1, 2).flatten(1)
         share = self.problem.loss.pixel_shares(self.weights).flatten()
         prior = self.prior()
         weights, radiance = share.expand_as(target), np.zeros((3, design.shape[1]))
@@ -106,7 +106,7 @@ class ProjectedModel(Model):
         self.solution = radiance.T
         self._store(self.solution[: len(self.atoms)], values[self.light.name])
         for lamp, unit, emission in zip(self.lamps, self.lamp_units, self.solution[len(self.atoms) :], strict=True):
-            values[lamp.name]["radiance"].copy_(self.setting.tensor(unit * self.setting.unit * emission))
+            values[lamp.name]["radiance"].copy_(self.context.tensor(unit * self.context.unit * emission))
 
     def _find_weights(self, images: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Weights of squares that stand for the loss at images, [color, pixel]; 0 where saturation allows them."""
@@ -136,7 +136,7 @@ class ProjectedModel(Model):
         else:
             stored_values = {"coefficients": self.atoms.T @ radiance / np.sqrt(4 * np.pi)}
         for key, numbers in stored_values.items():
-            values[key].copy_(self.setting.tensor(numbers))
+            values[key].copy_(self.context.tensor(numbers))
 
 
 def atoms(light: Light) -> np.ndarray:
@@ -165,8 +165,8 @@ def nonnegative_least_squares(form: np.ndarray, slope: np.ndarray) -> np.ndarray
     return solution
 
 
-def make_model(problem: Problem, setting: Setting, stage: Stage) -> Model:
+def make_model(problem: Problem, context: FitContext, stage: Stage) -> Model:
     """The cheapest model that a problem and a stage allow."""
     if stage.solves_light:
-        return ProjectedModel(problem, setting, stage)
-    return (LightModel if LightModel.applies(problem) else Model)(problem, setting, stage)
+        return ProjectedModel(problem, context, stage)
+    return (LightModel if LightModel.applies(problem) else Model)(problem, context, stage)

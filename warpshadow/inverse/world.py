@@ -22,7 +22,7 @@ from warpshadow.torch import TorchRenderer
 T = TypeVar("T")
 
 
-class Setting:
+class FitContext:
     """Shared by all stages of a fit: the scene at the start and the units of its parameters.
 
     Args:

@@ -147,7 +147,7 @@ def project_map(pixels: np.ndarray, order: int) -> np.ndarray:
     coefficients = np.einsum("hk,hkc->kc", polar, rows[:, order - 1 + degree])
 
     own_from_map = np.array([[0, 1, 0], [0, 0, 1], [-1, 0, 0]])  # of (cos φ sin θ, sin φ sin θ, cos θ), a direction
-    return rotation_matrix(order, own_from_map) @ coefficients
+    return harmonic_rotation(order, own_from_map) @ coefficients
 
 
 def reconstruct_map(coefficients: np.ndarray, height: int) -> np.ndarray:
@@ -188,7 +188,7 @@ def zonal_basis(order: int, z: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------- rotation
 
 
-def rotation_matrix(order: int, rotation: np.ndarray) -> np.ndarray:
+def harmonic_rotation(order: int, rotation: np.ndarray) -> np.ndarray:
     """Matrix that turns coefficients as ``rotation`` turns directions, block-diagonal in the bands.
 
     Args:
@@ -218,7 +218,7 @@ def rotation_generators(order: int) -> np.ndarray:
     about_z = np.zeros((order**2, order**2))
     about_z[np.arange(order**2) - 2 * degree, np.arange(order**2)] = degree
     axis_rotations = np.roll(np.eye(3), 1, axis=0), np.roll(np.eye(3), 2, axis=0), np.eye(3)  # z to x, to y, and to z
-    basis_rotations = [rotation_matrix(order, turn) for turn in axis_rotations]
+    basis_rotations = [harmonic_rotation(order, turn) for turn in axis_rotations]
     return np.stack([turn @ about_z @ turn.T for turn in basis_rotations])
 
 

@@ -61,8 +61,8 @@ class Explanation:
         self.stages: dict[str, StageReport] = {}
         for node in decisions:
             if node not in hidden:
-                for stage in node.stages:
-                    self.stages[stage.name] = _report(stage, node, _stage_decision(stage, node, decisions[node]))
+                for row in node.rows:
+                    self.stages[row.name] = _report(row, node, _row_decision(row, node, decisions[node]))
         self.timings = dict(timings)
         self.notes = list(notes)
         if not is_host:
@@ -116,7 +116,7 @@ def decide_which_nodes_run(image: Node, call: Call) -> dict[Node, Decision]:
         node_decision = _decision(node, call, reason)
         # an idle node passes the question on to its inputs
         is_idle = not node_decision and node.value_if_known(call) is None
-        for item in node.before:
+        for item in node.dependencies:
             visit(item, reason if is_idle else node_decision)
         decisions[node] = node_decision
 
@@ -126,7 +126,7 @@ def decide_which_nodes_run(image: Node, call: Call) -> dict[Node, Decision]:
 
 def _decision(node: Node, call: Call, reason: Decision) -> Decision:
     """Whether a node runs, given why it is asked for, or why it is not."""
-    if node.stage is not None and (idle := _text(node.stage.idle)):
+    if node.row is not None and (idle := _text(node.row.idle)):
         return Decision(False, idle)
     if node.value_if_known(call) is not None:
         return Decision(False, f"cached: {_names(node.root_inputs)} are the same")
@@ -145,25 +145,25 @@ def _reason_to_run(inputs: Iterable[AnyInput], reason: Decision, otherwise: str 
     return Decision(True, otherwise) if otherwise else reason
 
 
-def _stage_decision(stage: ExplainRow, node: Node, decision: Decision) -> Decision:
-    """Whether a stage of a node runs, given the decision about the node."""
-    if stage is node.stage:
+def _row_decision(row: ExplainRow, node: Node, decision: Decision) -> Decision:
+    """Whether a row of a node runs, given the decision about the node."""
+    if row is node.row:
         return decision
-    if idle := _text(stage.idle):
+    if idle := _text(row.idle):
         return Decision(False, idle)
-    return _reason_to_run(stage.inputs, decision)
+    return _reason_to_run(row.inputs, decision)
 
 
-def _report(stage: ExplainRow, node: Node, forward: Decision) -> StageReport:
+def _report(row: ExplainRow, node: Node, forward: Decision) -> StageReport:
     """A stage of a node; its adjoint runs if it runs itself and something before it requires a gradient."""
-    differentiated = dict.fromkeys(root for item in stage.inputs or (node,) for root in item.differentiated_inputs)
+    differentiated = dict.fromkeys(root for item in row.inputs or (node,) for root in item.differentiated_inputs)
     if not forward:
         backward = Decision(False, "nothing is computed")
-    elif differentiated and stage.has_adjoint:
+    elif differentiated and row.has_adjoint:
         backward = Decision(True, f"a gradient to {_names(differentiated)} is asked for")
     else:
         backward = Decision(False, "nothing before it requires a gradient")
-    return StageReport(stage.name, forward, backward, _text(stage.items) if forward else "")
+    return StageReport(row.name, forward, backward, _text(row.items) if forward else "")
 
 
 def _names(inputs: Iterable[Input]) -> str:

@@ -93,7 +93,7 @@ First = TypeVar("First")
 R = TypeVar("R")
 
 
-class _Taking(Protocol[P, Inputs_co]):
+class _AcceptsFields(Protocol[P, Inputs_co]):
     """A decorator of methods that take a record, by itself or after another argument."""
 
     @overload
@@ -102,7 +102,7 @@ class _Taking(Protocol[P, Inputs_co]):
     def __call__(self, method: Callable[[Owner, First, Inputs_co], R]) -> Callable[Concatenate[Owner, First, P], R]: ...
 
 
-def accepts_fields_of(record: Callable[P, Inputs_co], **remedies: str) -> _Taking[P, Inputs_co]:
+def accepts_fields_of(record: Callable[P, Inputs_co], **remedies: str) -> _AcceptsFields[P, Inputs_co]:
     """Let users give the fields of a record as arguments to a method whose last argument is the record, ``inputs``.
 
     The method's signature, types and documentation then say them one by one.
@@ -123,16 +123,18 @@ def accepts_fields_of(record: Callable[P, Inputs_co], **remedies: str) -> _Takin
         signature = inspect.signature(method).replace(parameters=[*others, *fields])
 
         @functools.wraps(method)
-        def taking(*args: Any, **arguments: Any) -> Any:
+        def accepting_fields(*args: Any, **arguments: Any) -> Any:
             bound = signature.bind(*args, **arguments).arguments
             inputs = record(**{name: bound.pop(name) for name in types if name in bound})  # type: ignore[call-arg]
             return method(**bound, inputs=inputs)
 
-        taking.__signature__ = signature  # type: ignore[attr-defined]
+        accepting_fields.__signature__ = signature  # type: ignore[attr-defined]
         hints = {name: hint for name, hint in method.__annotations__.items() if name != "inputs"}
-        taking.__annotations__ = hints | types
-        taking.__doc__ = re.sub(r"^ +inputs: .*$", lambda _: entries, method.__doc__ or "", flags=re.MULTILINE)
-        return check.keywords(**remedies)(taking)
+        accepting_fields.__annotations__ = hints | types
+        accepting_fields.__doc__ = re.sub(
+            r"^ +inputs: .*$", lambda _: entries, method.__doc__ or "", flags=re.MULTILINE
+        )
+        return check.keywords(**remedies)(accepting_fields)
 
     return decorate  # type: ignore[return-value]
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.device.constants import use
+from warpshadow.device.constants import note_use
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.memory import copied
 from warpshadow.device.tape import record
@@ -25,7 +25,7 @@ class Input:
     """An input of the pipeline: a value that the caller gives.
 
     Args:
-        name: Name of the stage.
+        name: Its name in words.
         value: The value; or a function that makes it when it is first asked for.
         why_new: Why it takes the place of another, in words, such as "light is given".
     Attributes:
@@ -52,7 +52,7 @@ class Input:
         """The value."""
         if callable(self._value):
             self._value = self._value()
-        use(self._value)
+        note_use(self._value)
         return self._value
 
     @classmethod
@@ -124,17 +124,17 @@ class Node:
     """A value of the pipeline that a function computes from inputs.
 
     Args:
-        name: Name of its own stage; empty for a node that is neither timed nor explained.
+        name: Name of its own row of ``explain``; empty for a node that is neither timed nor explained.
         function: Computes the value from the inputs' values; None where there is nothing to compute: the value is None.
         inputs: Nodes and inputs of the pipeline; anything else is passed on as it is.
         items, idle, has_adjoint: As for :class:`ExplainRow`; a function of an idle node passes something on.
         caches: Whether the value may outlive a call.
         extra_inputs: Other nodes that run for this one.
-        stages: Further rows, before its own.
+        rows: Further rows, before its own.
 
     Attributes:
-        stage: Its own stage; None without a name.
-        before: The nodes and inputs that it depends on at once.
+        row: Its own row of ``explain``; None without a name.
+        dependencies: The nodes and inputs that it depends on at once.
         root_inputs: All inputs that it depends on.
         requires_grad: Whether a gradient to any of them is asked for; then nothing is cached.
         differentiated_inputs: The inputs that get a gradient from here.
@@ -150,18 +150,18 @@ class Node:
         has_adjoint: bool = True,
         caches: bool = True,
         extra_inputs: tuple["Node", ...] = (),
-        stages: tuple[ExplainRow, ...] = (),
+        rows: tuple[ExplainRow, ...] = (),
     ):
         self.function, self.inputs = function, inputs
-        self.stage = ExplainRow(name, items, idle, has_adjoint) if name else None
-        self.stages = stages if self.stage is None else (*stages, self.stage)
-        self.before: list[AnyInput] = []
+        self.row = ExplainRow(name, items, idle, has_adjoint) if name else None
+        self.rows = rows if self.row is None else (*rows, self.row)
+        self.dependencies: list[AnyInput] = []
         self.root_inputs: dict[Input, None] = {}  # in order
         self.differentiated_inputs: dict[Input, None] = {}
         self.requires_grad = False
         for item in (*inputs, *extra_inputs):
             if isinstance(item, (Node, Input)):
-                self.before.append(item)
+                self.dependencies.append(item)
                 self.root_inputs |= item.root_inputs
                 self.differentiated_inputs |= item.differentiated_inputs
                 self.requires_grad |= item.requires_grad
@@ -172,7 +172,7 @@ class Node:
     def value(self, call: "Call") -> Any:
         """The value, which is computed unless it is cached or the call has it."""
         if self.is_cached:
-            use(self._cached)
+            note_use(self._cached)
             return self._cached
         if self not in call:
             value = self.compute(call)
@@ -188,16 +188,16 @@ class Node:
         if self.function is None:
             return None
         values = self.values(call)
-        if self.stage is None or isinstance(self.stage.idle, str) and self.stage.idle:
+        if self.row is None or isinstance(self.row.idle, str) and self.row.idle:
             return self.function(*values)
-        with self.timed(call, self.stage):
+        with self.timed(call, self.row):
             return self.function(*values)
 
-    def timed(self, call: "Call", stage: ExplainRow) -> AbstractContextManager[None]:
-        """Time one of its stages while it computes its value."""
-        inputs = stage.inputs or (self,)
-        is_marked = stage.has_adjoint and any(item.differentiated_inputs for item in inputs)
-        return call.timed(stage.name, is_marked=is_marked)
+    def timed(self, call: "Call", row: ExplainRow) -> AbstractContextManager[None]:
+        """Time one of its rows while it computes its value."""
+        inputs = row.inputs or (self,)
+        is_marked = row.has_adjoint and any(item.differentiated_inputs for item in inputs)
+        return call.timed(row.name, is_marked=is_marked)
 
     def values(self, call: "Call") -> list[Any]:
         """The values of the inputs."""
@@ -226,7 +226,7 @@ def detached(node: AnyInput, *, is_constant: bool = False) -> Node:
     result = Node("", identity, node, caches=False)
     result.differentiated_inputs = {}
     if is_constant:
-        result.before, result.root_inputs, result.requires_grad = [], {}, False
+        result.dependencies, result.root_inputs, result.requires_grad = [], {}, False
     return result
 
 

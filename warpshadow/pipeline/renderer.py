@@ -30,10 +30,10 @@ from warpshadow.pipeline.methods.by_name import make_method
 from warpshadow.pipeline.node import Clock, Input, Node
 from warpshadow.pipeline.receivers.choice_of_receivers import choose_receivers, receiver_notes, with_receivers
 from warpshadow.pipeline.receivers.shading_context import ShadingContext
-from warpshadow.pipeline.receivers.unevenness import NearLight
+from warpshadow.pipeline.receivers.unevenness import EmitterLuminance
 from warpshadow.pipeline.shading.transfers import LightArgument, join_rows
 from warpshadow.pipeline.transport import LightTransport
-from warpshadow.pipeline.views.catchers import CatchersAlone
+from warpshadow.pipeline.views.catchers import CatcherScene
 from warpshadow.pipeline.views.layers import LayerArrays, Layers, find_layer_arrays, find_layers
 from warpshadow.pipeline.views.scene_views import SceneViews, camera_batch
 from warpshadow.pipeline.views.shading_ratio import shading_ratio
@@ -57,7 +57,7 @@ class ViewArrays(ImageArrays):
     view: View | None = None
 
 
-_OF_CAMERAS = ("_scene_view", "_catchers_alone")  # cached values of a renderer's cameras
+_CACHED_BY_CAMERAS = ("_scene_view", "_catcher_scene")  # cached values of a renderer's cameras
 
 
 class SceneRenderer:
@@ -113,7 +113,7 @@ class SceneRenderer:
                     merged_scene,
                     self.cameras,
                     is_light_free=basis is not None,
-                    near_light=_find_near_light(merged_scene),
+                    emitter_luminance=_emitter_luminance(merged_scene),
                 )
         self._given_scene, self.scene = scene, with_receivers(scene, self._choices)
         self.merged_scene = merged_scene.with_settings(self.scene)
@@ -139,12 +139,12 @@ class SceneRenderer:
             cameras: Any number of them, of one size and near plane, whose images are a batch.
         """
         other = object.__new__(type(self))
-        vars(other).update({name: value for name, value in vars(self).items() if name not in _OF_CAMERAS})
+        vars(other).update({name: value for name, value in vars(self).items() if name not in _CACHED_BY_CAMERAS})
         other._arguments = self._arguments | {"cameras": cameras}
         other.cameras, other.has_camera_batch = camera_batch(cameras), True
         other._views = self._views.with_cameras(other.cameras)
-        if "_catchers_alone" in vars(self):
-            vars(other)["_catchers_alone"] = self._catchers_alone.with_cameras(other.cameras)
+        if "_catcher_scene" in vars(self):
+            vars(other)["_catcher_scene"] = self._catcher_scene.with_cameras(other.cameras)
         return other
 
     def moved(self: RendererType, device: wp.DeviceLike) -> RendererType:
@@ -374,7 +374,7 @@ class SceneRenderer:
         if photograph is not None:
             check.shape("photograph", photograph.shape, ("batch", *self._size))
             finite_arrays({"photograph": photograph})
-        catchers, materials = self._catchers_alone, self.materials(inputs.of_bodies)
+        catchers, materials = self._catcher_scene, self.materials(inputs.of_bodies)
         geometry, alone = None, None
         if inputs.geometry is not None:
             geometry = as_geometry("geometry", inputs.geometry)
@@ -394,8 +394,8 @@ class SceneRenderer:
         return self.cameras[0].height, self.cameras[0].width
 
     @functools.cached_property
-    def _catchers_alone(self) -> CatchersAlone:
-        return CatchersAlone(self._of_bodies_alone(self.scene.catchers)._views, self.merged_scene)
+    def _catcher_scene(self) -> CatcherScene:
+        return CatcherScene(self._of_bodies_alone(self.scene.catchers)._views, self.merged_scene)
 
     def _of_bodies_alone(self, numbers: tuple[int, ...]) -> "SceneRenderer":
         """Make a renderer of some bodies alone, with the receivers and spheres that they have here; it never warns."""
@@ -488,7 +488,7 @@ class SceneRenderer:
         )
 
 
-def _find_near_light(merged_scene: MergedScene) -> NearLight | None:
+def _emitter_luminance(merged_scene: MergedScene) -> EmitterLuminance | None:
     """Light of emitters for the choice of receivers; None without any."""
     if not merged_scene.is_emitter.any():
         return None

@@ -14,7 +14,7 @@ first two, by light, bounces, reflectance, and where bodies and cameras are:
 | free | some | any | given | moving patches | static patches |
 
 Cameras are the scene's where a call gives none and the renderer has one. The first two rows are
-:meth:`.Method.direct_shading`, the others :func:`choose_bouncing`. Static patches cache form factors, so that an
+:meth:`.Method.direct_shading`, the others :func:`choose_bounce_solver`. Static patches cache form factors, so that an
 iteration is small matrices; moving ones find all but cached visibility in each call. A shell is part of the light.
 Light of emitters is added here; the radiance that they show, and gloss, in :meth:`.View.image`.
 """
@@ -39,7 +39,7 @@ if TYPE_CHECKING:  # they are imported where light bounces, or bodies shine
     from warpshadow.pipeline.shading.lobe_light import LitLobes
 
 
-class Bouncing(enum.Enum):
+class BounceSolver(enum.Enum):
     """How light bounces, in words."""
 
     PATHS = "along paths"
@@ -47,9 +47,9 @@ class Bouncing(enum.Enum):
     MOVING = "between patches that may move"
 
 
-def choose_bouncing(
+def choose_bounce_solver(
     *, is_free: bool, is_given: bool, is_of_scene: bool, has_spheres: bool, shares_directions: bool
-) -> Bouncing:
+) -> BounceSolver:
     """Choose how light bounces: the lower rows of the table above.
 
     Args:
@@ -59,8 +59,8 @@ def choose_bouncing(
         has_spheres, shares_directions: Of the method.
     """
     if has_spheres:
-        return Bouncing.STATIC if is_of_scene and (is_free or is_given) else Bouncing.MOVING
-    return Bouncing.STATIC if is_free or is_given or shares_directions else Bouncing.PATHS
+        return BounceSolver.STATIC if is_of_scene and (is_free or is_given) else BounceSolver.MOVING
+    return BounceSolver.STATIC if is_free or is_given or shares_directions else BounceSolver.PATHS
 
 
 class LightTransport:
@@ -98,10 +98,10 @@ class LightTransport:
             return bounce()
         return self.method.cached_for_light("shading", points, light, bounce)
 
-    def bouncing(self, points: ShadingContext, light: LightInput, materials: Materials) -> Bouncing:
+    def bounce_solver(self, points: ShadingContext, light: LightInput, materials: Materials) -> BounceSolver:
         """How light bounces onto points."""
         shell_moves = light.shell is not None and light.shell.requires_grad
-        return choose_bouncing(
+        return choose_bounce_solver(
             is_free=light.is_free,
             is_given=materials is not points.materials,
             is_of_scene=points.is_scene_view and not shell_moves,
@@ -115,15 +115,15 @@ class LightTransport:
         if not count:
             return []
         times = "until none is left" if count == "all" else f"{count} time{'s' * (count != 1)}"
-        return [f"Light bounces {times}, {self.bouncing(points, light, materials).value}."]
+        return [f"Light bounces {times}, {self.bounce_solver(points, light, materials).value}."]
 
     def _bounced(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Shading of points, direct and bounced."""
-        bouncing = self.bouncing(points, light, materials)
-        if bouncing is Bouncing.MOVING:
+        bounce_solver = self.bounce_solver(points, light, materials)
+        if bounce_solver is BounceSolver.MOVING:
             return self._moving_bounces.shading(points, light, materials)
         direct = self.method.direct_shading(points, light)
-        if bouncing is Bouncing.PATHS:
+        if bounce_solver is BounceSolver.PATHS:
             return self.method.along_paths(direct, points, light, materials)
         static = self._static_bounces
         if not light.is_free:
@@ -156,7 +156,7 @@ class LightTransport:
         It is found by the rays along which light bounces between static patches; None where light bounces in another
         way.
         """
-        if self.bouncing(points, light, materials) is not Bouncing.STATIC:
+        if self.bounce_solver(points, light, materials) is not BounceSolver.STATIC:
             return None
         lit = None if light.is_free else self._lit_patch_samples(points, light, materials)
         return self._static_bounces.openness(points, materials, lit)

@@ -12,7 +12,7 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.image import ImageError, read_rgb
 from warpshadow.check import AnyPath
 from warpshadow.device.tape import unrecorded
-from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
+from warpshadow.pipeline.receivers.choice_of_receivers import for_still
 from warpshadow.rendering.renderer import Renderer
 from warpshadow.scene.scene import Scene, check_scene
 
@@ -53,7 +53,7 @@ def insert(
     pixels = _linear_photograph(photograph)
     height, width, _ = pixels.shape
     camera, gain = _fitting_camera(scene.camera, width, height), 2.0 ** check.number("exposure", exposure)
-    renderer = Renderer(for_picture(replace(scene, camera=camera)), device=device, progress=progress)
+    renderer = Renderer(for_still(replace(scene, camera=camera)), device=device, progress=progress)
     photo = wp.array(pixels[None] / gain, dtype=wp.vec3, device=renderer.device)
     with unrecorded():
         image: np.ndarray = renderer.insert(photo).numpy()[0] * np.float32(gain)

@@ -9,7 +9,7 @@ from warpshadow import check
 from warpshadow.assets.basis import Basis, check_basis
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline import renderer
-from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
+from warpshadow.pipeline.receivers.choice_of_receivers import for_still
 from warpshadow.scene.scene import Scene, check_scene
 from warpshadow.scene.visibility import METHODS_OF_SETTING
 from warpshadow.tuning import tune
@@ -66,11 +66,11 @@ def render(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = True
     "directional" then. "Stills and renderers" in pipeline/README.md says when, and by how much both images differ. A
     method that is named gives the same method in both: ``Visibility("directional")``, or ``Visibility("ray-traced",
     sampling="shared")``, which this takes. By "directional" receivers differ still
-    (:func:`.receivers.choice_of_receivers.for_picture`): with ``Body(…, receivers="pixel")`` and
+    (:func:`.receivers.choice_of_receivers.for_still`): with ``Body(…, receivers="pixel")`` and
     ``Visibility(self_shadows="rays")`` both are the same.
 
     Returns:
         Linear RGB, premultiplied, and coverage, float32 of shape [height, width, 4]; the background is 0.
     """
     check_scene(scene)
-    return Renderer(for_picture(scene), device=device, progress=progress).render()
+    return Renderer(for_still(scene), device=device, progress=progress).render()

@@ -13,7 +13,7 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import common_batch
-from warpshadow.device.constants import Identity
+from warpshadow.device.constants import IdentityKey
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.bodies.geometry import GEOMETRY_DTYPES, PLACED, Geometry, as_geometry
 from warpshadow.pipeline.image_inputs import ImageInputs
@@ -74,18 +74,18 @@ class Arguments:
         self.tensors = [tensor.expand(count, *tensor.shape[1:]) for tensor in self.tensors]
 
     def add_geometry(
-        self, name: str, geometry: Geometry[torch.Tensor], own_geometry: Geometry[wp.array]
+        self, name: str, geometry: Geometry[torch.Tensor], scene_geometry: Geometry[wp.array]
     ) -> Geometry[Slot]:
         """Add the tensors of a geometry, which has as many items as the scene's own geometry."""
-        geometry, own_arrays = as_geometry(name, geometry), own_geometry.arrays()
+        geometry, scene_arrays = as_geometry(name, geometry), scene_geometry.arrays()
         slots = {
-            part: self.add(f"{name}.{part}", tensor, GEOMETRY_DTYPES[part], own_arrays[part].shape[1:], PLACED)
+            part: self.add(f"{name}.{part}", tensor, GEOMETRY_DTYPES[part], scene_arrays[part].shape[1:], PLACED)
             for part, tensor in geometry.arrays().items()
         }
         rotations = None
         if geometry.rotations is not None:
-            assert own_geometry.rotations is not None
-            rotations = self.add(f"{name}.rotations", geometry.rotations, wp.mat33, own_geometry.rotations.shape[1:])
+            assert scene_geometry.rotations is not None
+            rotations = self.add(f"{name}.rotations", geometry.rotations, wp.mat33, scene_geometry.rotations.shape[1:])
         return Geometry(**slots, rotations=rotations, moving=geometry.moving, deformed=geometry.deformed)
 
     def filled(self, value: Any) -> Any:
@@ -143,7 +143,7 @@ def _key(value: Any) -> Hashable:
         return *value.arrays().values(), value.rotations, value.moving, value.deformed
     if isinstance(value, ImageInputs):
         return tuple(map(_key, vars(value).values()))
-    return tuple(map(_key, value)) if isinstance(value, list) else Identity(value)
+    return tuple(map(_key, value)) if isinstance(value, list) else IdentityKey(value)
 
 
 def _filled(value: Any, arrays: Sequence[wp.array]) -> Any:

@@ -23,7 +23,7 @@ from warpshadow.torch.renderer import TorchRenderer
 
 _CAMERAS = "clip_matrices=renderer.clip_matrices(R, t, K), R, t and K of renderer.scene_cameras(), one for each image"
 _PLACED = "geometry=renderer.placed(which, rotations, translations)"
-_ELSEWHERE = {
+_KEYWORD_REMEDIES = {
     **dict.fromkeys(("camera", "cameras"), _CAMERAS),
     **dict.fromkeys(("poses", "rotations", "translations"), _PLACED),
     "envmap": "light=",
@@ -80,7 +80,7 @@ class MixedRenderer(torch.nn.Module):
         return self._renderer(0).device
 
     @outside_torch_compile
-    @accepts_fields_of(MixedTensors, **_ELSEWHERE)
+    @accepts_fields_of(MixedTensors, **_KEYWORD_REMEDIES)
     def forward(self, which: torch.Tensor | Sequence[int], inputs: MixedTensors) -> torch.Tensor:
         """Render a batch of images.
 
@@ -180,8 +180,8 @@ class MixedRenderer(torch.nn.Module):
         translations = torch.zeros(scene_count, body_count, 3, device=self.device)
         scales = torch.ones(scene_count, body_count, device=self.device)
         for scene in range(scene_count):
-            own_poses = self._renderer(scene).scene_poses(pivot=pivot)
-            for all_poses, poses in zip((rotations, translations, scales), own_poses, strict=True):
+            poses_of_scene = self._renderer(scene).scene_poses(pivot=pivot)
+            for all_poses, poses in zip((rotations, translations, scales), poses_of_scene, strict=True):
                 all_poses[scene, : len(poses)] = poses
         return rotations, translations, scales
 

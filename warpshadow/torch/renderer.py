@@ -28,7 +28,7 @@ from warpshadow.torch.arguments import Arguments, Slot
 from warpshadow.torch.autograd import outside_torch_compile
 from warpshadow.torch.replay import Replays
 
-_ELSEWHERE = {
+_KEYWORD_REMEDIES = {
     **dict.fromkeys(
         ("camera", "cameras"),
         "TorchRenderer(scene, cameras=[…]), or for free cameras clip_matrices=renderer.clip_matrices(R, t, K)",
@@ -169,7 +169,7 @@ class TorchRenderer(torch.nn.Module):
             raise ValueError(f"state_dict: got that of a TorchRenderer with {stored_meaning}, expected {expected}")
 
     @outside_torch_compile
-    @accepts_fields_of(ImageTensors, **_ELSEWHERE)
+    @accepts_fields_of(ImageTensors, **_KEYWORD_REMEDIES)
     @with_lock_and_progress
     def forward(self, inputs: ImageTensors) -> torch.Tensor:
         """Render images.
@@ -218,7 +218,7 @@ class TorchRenderer(torch.nn.Module):
         return LayerTensors(depth, normals, bodies, masks.movedim(-1, -3))
 
     @outside_torch_compile
-    @accepts_fields_of(ImageTensors, **_ELSEWHERE)
+    @accepts_fields_of(ImageTensors, **_KEYWORD_REMEDIES)
     @with_lock_and_progress
     def insert(self, photograph: torch.Tensor, inputs: ImageTensors) -> torch.Tensor:
         """Render the bodies in a photograph whose surfaces the scene's shadow catchers model.
@@ -239,7 +239,7 @@ class TorchRenderer(torch.nn.Module):
         return arguments.apply(self.array_renderer.insert_inputs, photograph_slot, slots)
 
     @outside_torch_compile
-    @accepts_fields_of(ImageTensors, **_ELSEWHERE)
+    @accepts_fields_of(ImageTensors, **_KEYWORD_REMEDIES)
     @locked
     def explain(self, inputs: ImageTensors) -> Explanation:
         """List the stages that a call with the same arguments computes and skips, as :meth:`Renderer.explain` does.

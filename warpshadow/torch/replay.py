@@ -22,14 +22,14 @@ import torch
 import warp as wp
 
 from warpshadow.device import cuda_graph
-from warpshadow.device.constants import collected
+from warpshadow.device.constants import collecting_constants
 from warpshadow.device.memory import require_gradient
 from warpshadow.device.tape import recorded, unrecorded
 from warpshadow.torch.autograd import Playback, TensorCall, array_of, as_array, current_stream, is_capturing, tensor_of
 
 _PLAIN_CALLS = 2  # of a kind before it is captured: the first compiles kernels and fills caches, as may the second
 _MAX_FAILURES = 2  # after which calls of a kind stay plain
-_MAX_KINDS = 8  # captured at a time: each holds the memory of its call
+_MAX_HISTORIES = 8  # captured at a time: each holds the memory of its call
 
 
 class Replays:
@@ -38,7 +38,7 @@ class Replays:
     def __init__(self, *, is_on: bool):
         self.is_on = is_on
         self.reason = "nothing was called yet"  # why the last call was plain; empty if it was replayed
-        self._kinds: dict[Hashable, _Kind] = {}
+        self._histories: dict[Hashable, _CallHistory] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies begin anew."""
@@ -55,13 +55,13 @@ class Replays:
         capture, self.reason = None, self._why_plain(call.device)
         if not self.reason:
             pairs = zip(call.tensors, call.requires_grad, strict=True)
-            kind_key = str(call.device), key_of(), tuple((tuple(tensor.shape), needs) for tensor, needs in pairs)
-            kind = self._kinds.pop(kind_key, None) or _Kind()
-            self._kinds[kind_key] = kind  # the last that was used
-            while len(self._kinds) > _MAX_KINDS:
-                del self._kinds[next(iter(self._kinds))]
+            call_key = str(call.device), key_of(), tuple((tuple(tensor.shape), needs) for tensor, needs in pairs)
+            history = self._histories.pop(call_key, None) or _CallHistory()
+            self._histories[call_key] = history  # the last that was used
+            while len(self._histories) > _MAX_HISTORIES:
+                del self._histories[next(iter(self._histories))]
             unchanged = [call.tensors[number] for number in reused if not call.requires_grad[number]]
-            capture, self.reason = kind.find(call, unchanged)
+            capture, self.reason = history.find(call, unchanged)
         return capture
 
     def _why_plain(self, device: torch.device) -> str:
@@ -72,7 +72,7 @@ class Replays:
         return "torch captures the call" if is_capturing(device) else ""
 
 
-class _Kind:
+class _CallHistory:
     """Calls that a graph can stand for."""
 
     def __init__(self) -> None:
@@ -131,7 +131,7 @@ class Capture:
             raise RuntimeError(f"{warp_device} has no memory pool (wp.set_mempool_enabled)")
         with current_stream(device), unrecorded():
             self.plain_seconds = self._seconds_of(lambda: function(*self._arguments))
-        with collected() as self._cached_values:
+        with collecting_constants() as self._cached_values:
             with (
                 wp.ScopedCapture(device=warp_device) as capture,
                 recorded() if any(requires_grad) else unrecorded() as tape,

@@ -125,14 +125,14 @@ class PointSample:
         Args:
             of_bodies: Receivers of each body: at "vertex" points are interpolated, else they are receivers themselves.
         """
-        is_own = np.array([receivers != "vertex" for receivers in of_bodies])[self.bodies]
-        receiver_rows, weights, corners = places_of_receivers(self._vertices, self._weights, is_own)
+        is_receiver = np.array([receivers != "vertex" for receivers in of_bodies])[self.bodies]
+        receiver_rows, weights, corners = places_of_receivers(self._vertices, self._weights, is_receiver)
         points, normals = (
             np.einsum("pk,pkc->pc", weights, values[self._vertices[receiver_rows]])
             for values in (self._positions, self._normals)
         )
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        shares = np.where(is_own[:, None], np.array([1, 0, 0], np.float32), self._weights)
+        shares = np.where(is_receiver[:, None], np.array([1, 0, 0], np.float32), self._weights)
         return PointReceivers(points, normals, self._sides[receiver_rows], weights, corners, shares)
 
     def error(self, shading: np.ndarray) -> float:
@@ -163,24 +163,24 @@ def seen_on_faces(view: View, chosen_samples: np.ndarray) -> tuple[np.ndarray, n
 
 
 def places_of_receivers(
-    vertices: np.ndarray, barycentrics: np.ndarray, is_own: np.ndarray
+    vertices: np.ndarray, barycentrics: np.ndarray, is_receiver: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the receivers of points: vertices of the faces that they lie on, or the points themselves.
 
     Args:
         vertices, barycentrics: Of the points, from :func:`seen_on_faces`.
-        is_own: Points that are receivers themselves, bool of shape [point].
+        is_receiver: Points that are receivers themselves, bool of shape [point].
     Returns:
         A point on whose face each receiver lies, shape [receiver]; where on it, shape [receiver, 3]; and the receivers
         of each point, shape [point, 3].
     """
-    themselves = np.flatnonzero(is_own)
-    unique, vertex_places, corners = np.unique(vertices[~is_own], return_index=True, return_inverse=True)
+    themselves = np.flatnonzero(is_receiver)
+    unique, vertex_places, corners = np.unique(vertices[~is_receiver], return_index=True, return_inverse=True)
     # a vertex lies on the face of a point of which it is a corner
-    points = np.concatenate([np.flatnonzero(~is_own)[vertex_places // 3], themselves])
+    points = np.concatenate([np.flatnonzero(~is_receiver)[vertex_places // 3], themselves])
     weights = np.concatenate([np.eye(3, dtype=np.float32)[vertex_places % 3], barycentrics[themselves]])
-    receivers = np.repeat(len(unique) + np.cumsum(is_own)[:, None] - 1, 3, axis=1)
-    receivers[~is_own] = corners.reshape(-1, 3)
+    receivers = np.repeat(len(unique) + np.cumsum(is_receiver)[:, None] - 1, 3, axis=1)
+    receivers[~is_receiver] = corners.reshape(-1, 3)
     return points, weights, receivers
 
 

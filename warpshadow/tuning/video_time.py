@@ -4,7 +4,7 @@ import warp as wp
 
 from warpshadow.device.parallel import thread_count
 from warpshadow.device.progress import show_time
-from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
+from warpshadow.pipeline.receivers.choice_of_receivers import for_still
 from warpshadow.scene.blockers import fitted_meshes
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import SHARED_DIRECTIONS
@@ -33,13 +33,13 @@ def still_seconds(scene: Scene) -> float:
     """Estimate the time of a still by shared rays on one thread [s]; without bounces."""
     faces = sum(body.mesh.face_count for body in scene.bodies if not body.mesh.is_flat)
     pixels = scene.camera.width * scene.camera.height
-    rays = for_picture(scene).visibility.ray_count / SHARED_DIRECTIONS
+    rays = for_still(scene).visibility.ray_count / SHARED_DIRECTIONS
     return _STILL_PIXEL_SECONDS * (max(faces, 1) / _BUNNY_FACES) ** 0.27 * pixels * rays
 
 
 def remark_on_stills(scene: Scene, frame_count: int, *, device: wp.DeviceLike = "cpu") -> str:
     """Say that stills of all frames are done before a renderer is set up, where that is so; else it is empty."""
-    if scene.visibility.method is not None or scene.bounces or for_picture(scene).visibility.method != "ray-traced":
+    if scene.visibility.method is not None or scene.bounces or for_still(scene).visibility.method != "ray-traced":
         return ""
     setup, stills = setup_seconds(scene, device=device), frame_count * still_seconds(scene)
     if setup <= stills:

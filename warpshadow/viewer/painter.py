@@ -19,7 +19,7 @@ from warpshadow.assets.light import EnvironmentMap, KnownLightArgument
 from warpshadow.device.threads import locked
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
-from warpshadow.pipeline.receivers.choice_of_receivers import for_picture
+from warpshadow.pipeline.receivers.choice_of_receivers import for_still
 from warpshadow.pipeline.views.view import View
 from warpshadow.rendering.renderer import Renderer
 from warpshadow.scene.scene import Scene
@@ -149,7 +149,7 @@ class Painter:
         """The renderer of the current state, and its key."""
         scene = viewer_state.settings(self.scene, quality)
         if not quality.is_moving:  # as the light is turned; it is given to each call
-            scene = replace(for_picture(replace(scene, light=self._light_of(viewer_state, quality))), light=scene.light)
+            scene = replace(for_still(replace(scene, light=self._light_of(viewer_state, quality))), light=scene.light)
         choices = viewer_state.spheres, tuple(body.receivers for body in scene.bodies), quality.is_moving
         settings = scene.visibility, scene.bounces, scene.supersampling, *choices
         key = (*vars(settings[0]).values(), *settings[1:])

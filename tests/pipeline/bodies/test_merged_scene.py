@@ -126,7 +126,7 @@ def test_faces_belong_to_the_vertices_of_their_body(device):
     for number, body in enumerate(merged_scene.scene.bodies):
         own = faces[body_of_face == number] - merged_scene.first_vertex[number]
         np.testing.assert_array_equal(own, body.mesh.faces)
-    edges = merged_scene.edges.numpy()
+    edges = merged_scene.face_neighbors.numpy()
     assert (body_of_face[edges] == body_of_face[:, None]).all()  # closed meshes: each edge has its other face
 
 

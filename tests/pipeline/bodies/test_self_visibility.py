@@ -162,7 +162,7 @@ def test_gradients_to_rotations_are_central_differences(receivers, method, mesh,
 
     All receivers move with their samples here: in images those along outlines have the mean slopes of colors instead.
     """
-    monkeypatch.setattr(receiver_finder, "find_mean_slopes", lambda *_: None)
+    monkeypatch.setattr(receiver_finder, "find_outline_samples", lambda *_: None)
     other = ws.Body(ws.icosphere(0.6, 2), blockers=ws.Spheres([[0, 0, 0]], [0.6]), translation=(-1.4, 0.3, 0))
     bodies = (other,) if method == "log-sh" else ()
     scene = scene_of(receivers, method=method, order=4, bodies=bodies)

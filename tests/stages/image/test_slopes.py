@@ -13,8 +13,8 @@ from warpshadow.stages.image.slopes import (
     MIN_DISTANCE,
     MIN_WEIGHT,
     REACH,
-    find_mean_slopes,
-    hold_fragments,
+    detach_near_outlines,
+    find_outline_samples,
     moving_radiance,
 )
 from warpshadow.stages.raster.project import to_clip
@@ -58,7 +58,7 @@ class Drawn:
         return find_edge_colors(samples, self.silhouettes, self.clip, self.shading, self.receivers, self.albedo)
 
     def mean_slopes(self):
-        return find_mean_slopes(self.silhouettes, self.clip)
+        return find_outline_samples(self.silhouettes, self.clip)
 
     def pulls(self, seeds, *masks):
         """Gradient to the clip positions by mean slopes."""
@@ -203,7 +203,7 @@ def test_samples_up_to_two_from_an_outline_have_mean_slopes_and_hold_their_point
     np.testing.assert_array_equal(mask.numpy().reshape(on_ball.shape), expected)
     drawn.fragments.barycentrics.grad.zero_()
     with wp.Tape() as tape:
-        held = hold_fragments(drawn.fragments, mask).barycentrics
+        held = detach_near_outlines(drawn.fragments, mask).barycentrics
     np.testing.assert_array_equal(held.numpy(), drawn.fragments.barycentrics.numpy())
     seeds = wp.array(drawn.seeds[..., :3], dtype=wp.vec3, device=device)
     tape.backward(grads={held: seeds})

@@ -34,9 +34,9 @@ def two_triangles(device, cameras: int, requires_grad=False):
     return positions, faces, wp.array(np.array(matrices), dtype=wp.mat44, device=device)
 
 
-def receivers_of(positions, faces, matrices, wants_samples, supersampling=1):
+def receivers_of(positions, faces, matrices, has_sample_receivers, supersampling=1):
     fragments = rasterize(to_clip(positions, matrices), faces, 12, 12)
-    wants = np.array(wants_samples)
+    wants = np.array(has_sample_receivers)
     numbering = number_receivers(np.repeat(~wants, 3)[None], device=faces.device)
     found = find_receivers(
         positions, vertex_normals(positions, faces), faces, fragments, numbering, wants, supersampling=supersampling
@@ -45,10 +45,10 @@ def receivers_of(positions, faces, matrices, wants_samples, supersampling=1):
 
 
 @pytest.mark.parametrize("cameras", [1, 3])
-@pytest.mark.parametrize("wants_samples", [(False, False), (True, False), (False, True), (True, True)])
-def test_what_samples_get_from_their_receivers_is_what_lies_where_they_look(device, cameras, wants_samples):
+@pytest.mark.parametrize("has_sample_receivers", [(False, False), (True, False), (False, True), (True, True)])
+def test_what_samples_get_from_their_receivers_is_what_lies_where_they_look(device, cameras, has_sample_receivers):
     positions, faces, matrices = two_triangles(device, cameras)
-    found, fragments = receivers_of(positions, faces, matrices, wants_samples)
+    found, fragments = receivers_of(positions, faces, matrices, has_sample_receivers)
     for own, attribute in ((found.points, positions), (found.normals, vertex_normals(positions, faces))):
         got = interpolate(found.fragments, found.faces, own).numpy()
         expected = interpolate(fragments, faces, attribute).numpy()
@@ -72,18 +72,20 @@ def means_over_pixels(image, face_ids, supersampling):
 
 
 @pytest.mark.parametrize("supersampling", [2, 3])
-@pytest.mark.parametrize("wants_samples", [(True, False), (True, True)])
-def test_samples_of_a_pixel_that_see_the_same_face_share_a_receiver_at_their_mean(device, supersampling, wants_samples):
+@pytest.mark.parametrize("has_sample_receivers", [(True, False), (True, True)])
+def test_samples_of_a_pixel_that_see_the_same_face_share_a_receiver_at_their_mean(
+    device, supersampling, has_sample_receivers
+):
     positions, faces, matrices = two_triangles(device, 2)
-    found, fragments = receivers_of(positions, faces, matrices, wants_samples, supersampling)
+    found, fragments = receivers_of(positions, faces, matrices, has_sample_receivers, supersampling)
     face_ids = fragments.face_ids.numpy()
-    is_own = (face_ids >= 0) & np.array(wants_samples)[face_ids]
+    is_own = (face_ids >= 0) & np.array(has_sample_receivers)[face_ids]
     for own, attribute in ((found.points, positions), (found.normals, vertex_normals(positions, faces))):
         got = interpolate(found.fragments, found.faces, own).numpy()
         at_samples = interpolate(fragments, faces, attribute).numpy()
         expected = np.where(is_own[..., None], means_over_pixels(at_samples, face_ids, supersampling), at_samples)
         assert np.abs(got - expected).max() < FLOAT32
-    own_count = found.points.shape[1] - 3 * (2 - sum(wants_samples))
+    own_count = found.points.shape[1] - 3 * (2 - sum(has_sample_receivers))
     assert is_own.sum(axis=(1, 2)).max() / supersampling**2 < own_count < 0.8 * is_own.sum(axis=(1, 2)).max()
 
 
@@ -229,11 +231,11 @@ def test_gradients_through_receivers_are_central_differences(device, verified_ta
     assert abs(products.sum() - (losses[0] - losses[1]) / 4e-3) < GRADIENT * np.linalg.norm(products)
 
 
-@pytest.mark.parametrize("wants_samples", [(False, False), (True, False), (False, True), (True, True)])
-def test_receivers_of_bodies_that_are_told_apart_follow_each_other(device, wants_samples):
+@pytest.mark.parametrize("has_sample_receivers", [(False, False), (True, False), (False, True), (True, True)])
+def test_receivers_of_bodies_that_are_told_apart_follow_each_other(device, has_sample_receivers):
     """The order differs, and nothing else; each span has receivers of its body alone."""
     positions, faces, matrices = two_triangles(device, 3)
-    normals, wants = vertex_normals(positions, faces), np.array(wants_samples)
+    normals, wants = vertex_normals(positions, faces), np.array(has_sample_receivers)
     fragments = rasterize(to_clip(positions, matrices), faces, 12, 12)
     bodies = np.array([1, -1])
     numbering = number_receivers(np.repeat(~wants, 3)[None], bodies=np.repeat(bodies, 3), device=faces.device)
@@ -260,7 +262,7 @@ def test_receivers_of_bodies_that_are_told_apart_follow_each_other(device, wants
             assert gaps.max() < FLOAT32
 
 
-def seen_points(device, mesh, matrix, *, rises, turned=False):
+def seen_points(device, mesh, matrix, *, lifts_to_smooth_surface, turned=False):
     """Points of all samples that see a mesh, from its front or, turned over, from behind."""
     positions = wp.array(mesh.positions[None], dtype=wp.vec3, device=device)
     faces = wp.array(mesh.faces[:, ::-1] if turned else mesh.faces, dtype=wp.vec3i, device=device)
@@ -268,12 +270,17 @@ def seen_points(device, mesh, matrix, *, rises, turned=False):
     fragments = rasterize(to_clip(positions, wp.array([matrix], dtype=wp.mat44, device=device)), faces, 24, 24)
     wants = np.ones(len(mesh.faces), bool)
     numbering = number_receivers(np.zeros((1, len(mesh.positions)), bool), device=faces.device)
-    return find_receivers(positions, normals, faces, fragments, numbering, wants, rises=rises).points.numpy()[0]
+    return find_receivers(
+        positions, normals, faces, fragments, numbering, wants, lifts_to_smooth_surface=lifts_to_smooth_surface
+    ).points.numpy()[0]
 
 
 def test_points_for_rays_rise_towards_the_surface_that_normals_round(device):
     ball, matrix = icosphere(1.0, 2), ws.Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=30, size=(24, 24)).clip_matrix()
-    flat, risen = (np.linalg.norm(seen_points(device, ball, matrix, rises=rises), axis=1) for rises in (False, True))
+    flat, risen = (
+        np.linalg.norm(seen_points(device, ball, matrix, lifts_to_smooth_surface=lifts_to_smooth_surface), axis=1)
+        for lifts_to_smooth_surface in (False, True)
+    )
     assert 1 - flat.min() > 0.015
     assert risen.min() > 1 - FLOAT32 and risen.max() - 1 < 1 - flat.min()  # out of its faces, and not far
 
@@ -284,10 +291,15 @@ def test_points_for_rays_stay_where_normals_say_nothing_of_a_smooth_surface(devi
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     box = ws.Mesh(corners, [triangle for a, b, c, d in quads for triangle in ((a, b, c), (a, c, d))])
     for mesh in (ws.plane(1.0, 2), box):  # vertices of the box have one normal for three faces
-        flat, risen = (seen_points(device, mesh, matrix, rises=rises) for rises in (False, True))
+        flat, risen = (
+            seen_points(device, mesh, matrix, lifts_to_smooth_surface=lifts_to_smooth_surface)
+            for lifts_to_smooth_surface in (False, True)
+        )
         assert np.abs(risen - flat).max() < FLOAT32
-    hollow = seen_points(device, icosphere(1.0, 2), matrix, rises=True, turned=True)
-    np.testing.assert_allclose(hollow, seen_points(device, icosphere(1.0, 2), matrix, rises=False), atol=FLOAT32)
+    hollow = seen_points(device, icosphere(1.0, 2), matrix, lifts_to_smooth_surface=True, turned=True)
+    np.testing.assert_allclose(
+        hollow, seen_points(device, icosphere(1.0, 2), matrix, lifts_to_smooth_surface=False), atol=FLOAT32
+    )
 
 
 @pytest.mark.parametrize("sampling", ["independent", "shared"])

@@ -152,5 +152,5 @@ def test_products_are_those_of_harmonics_with_their_gradients(order, bands, devi
 def test_generators_are_slopes_of_rotations():
     generators = sh.rotation_generators(5)
     for axis in range(3):
-        ends = [sh.rotation_matrix(5, turned_on(np.eye(3), sign * STEP * np.eye(3)[axis])) for sign in (1, -1)]
+        ends = [sh.harmonic_rotation(5, turned_on(np.eye(3), sign * STEP * np.eye(3)[axis])) for sign in (1, -1)]
         np.testing.assert_allclose(generators[axis], (ends[0] - ends[1]) / (2 * STEP), atol=1e-7)

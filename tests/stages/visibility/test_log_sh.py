@@ -249,7 +249,7 @@ def test_moving_and_scaling_the_scene_turns_the_result(seed, exponent, log):
         order=4,
         log=log,
     )
-    expected = rows @ sh.rotation_matrix(4, rotation).T
+    expected = rows @ sh.harmonic_rotation(4, rotation).T
     # the offset of 4 against radii of 0.05 costs a digit or two of float32
     assert row_errors(moved[clear], expected[clear]).max(initial=0) < 1e-4
 

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from warpshadow import check
-from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.scene.scene import BodyLike, Scene
 
 Values = dict[str, torch.Tensor]
@@ -53,11 +53,11 @@ class Free(abc.ABC):
         return
 
     @abc.abstractmethod
-    def start(self, setting: Setting) -> Values:
+    def start(self, context: FitContext) -> Values:
         """Values where the scene has them."""
 
     @abc.abstractmethod
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
         """Put values into the world. Differentiable: values."""
 
     def scattered(self, values: Values, number: int, generator: torch.Generator) -> Values:
@@ -71,14 +71,14 @@ class Free(abc.ABC):
         return {key: tensor.detach().clone() for key, tensor in values.items()}
 
     @abc.abstractmethod
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         """Write final values into the fitted scene."""
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
         """The fitted numbers by their keys in scene files, if they are few."""
         return {}
 
-    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
+    def regularizer(self, values: Values, context: FitContext) -> torch.Tensor | None:
         """Regularizer, to be added to the loss; None for none. Differentiable: values."""
         return None
 

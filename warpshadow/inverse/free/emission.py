@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from warpshadow import check
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.free.reflectance import FreeOfSurface
-from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene
 
@@ -40,24 +40,24 @@ class Emission(FreeOfSurface):
         check_emits(scene, self.number)
         super().check_scene(scene)
 
-    def _unit(self, setting: Setting) -> float:
+    def _unit(self, context: FitContext) -> float:
         """Radiance that counts as 1: a lamp is far brighter than its image."""
-        start = setting.scene.bodies[self.number].emission
+        start = context.scene.bodies[self.number].emission
         assert start is not None
-        return float(start.mean()) or setting.unit
+        return float(start.mean()) or context.unit
 
     def rows(self, body: Body) -> np.ndarray:
         return np.atleast_2d(np.asarray(body.emission))
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
-        radiance = values["radiance"].clamp(min=0) * self._unit(setting)  # line searches look beyond
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
+        radiance = values["radiance"].clamp(min=0) * self._unit(context)  # line searches look beyond
         world.emission[self.number] = radiance if self.size is None else radiance[None]
 
     def project(self, values: Values) -> None:
         values["radiance"].clamp_(min=0)
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        radiance = (values["radiance"] * self._unit(setting)).cpu().numpy()
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
+        radiance = (values["radiance"] * self._unit(context)).cpu().numpy()
         fitted.change_body(self.number, emission=radiance[0] if self.is_one else radiance)
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:

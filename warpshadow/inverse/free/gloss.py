@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from warpshadow import check
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.free.reflectance import FreeOfSurface
-from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.scene.body import Body
 from warpshadow.scene.material import GLOSS_DEFAULTS
 from warpshadow.scene.scene import Scene
@@ -29,10 +29,10 @@ class _Gloss(FreeOfSurface):
         value = getattr(body, self.key)
         return (np.full(1, GLOSS_DEFAULTS[self.key]) if value is None else value)[..., None]
 
-    def start(self, setting: Setting) -> Values:
-        return {"value": super().start(setting)["value"][..., 0].contiguous()}
+    def start(self, context: FitContext) -> Values:
+        return {"value": super().start(context)["value"][..., 0].contiguous()}
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
         value = self._bounded(values["value"])  # line searches look beyond
         world.gloss[self.key][self.number] = value if self.size is None else value[None]
 
@@ -43,7 +43,7 @@ class _Gloss(FreeOfSurface):
     def _bounded(self, numbers: torch.Tensor) -> torch.Tensor:
         return numbers.clamp(MIN_ROUGHNESS if self.key == "roughness" else 0, 1)
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         fitted.change_body(self.number, **{self.key: values["value"].cpu().numpy()})
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:

@@ -11,7 +11,7 @@ from warpshadow import check
 from warpshadow.inverse import constraints
 from warpshadow.inverse.free.base import FreeOfBody, Values
 from warpshadow.inverse.free.emission import check_emits
-from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.maths.directions import fibonacci
 from warpshadow.scene.scene import Scene
 
@@ -41,54 +41,54 @@ class Lamp(FreeOfBody):
         if all(body.is_emitter for body in scene.bodies):
             raise ValueError(f"body: got {self.number} in a scene of lamps alone, expected another body that it lights")
 
-    def start(self, setting: Setting) -> Values:
-        return {"turn": setting.tensor(np.zeros(2)), "log_distance": setting.tensor(0.0)}
+    def start(self, context: FitContext) -> Values:
+        return {"turn": context.tensor(np.zeros(2)), "log_distance": context.tensor(0.0)}
 
-    def _start(self, setting: Setting) -> tuple[np.ndarray, np.ndarray, float]:
+    def _start(self, context: FitContext) -> tuple[np.ndarray, np.ndarray, float]:
         """Middle of the others, and from there the direction and the distance of the lamp in the scene."""
 
         def find() -> tuple[np.ndarray, np.ndarray, float]:
-            others = [body for body in setting.scene.bodies if not body.is_emitter]
+            others = [body for body in context.scene.bodies if not body.is_emitter]
             solid = [body for body in others if not body.mesh.is_flat]  # which count alone, if there are any
             middle = np.mean([np.mean(body.world_mesh().bounds, axis=0) for body in solid or others], axis=0)
-            offset = setting.scene.bodies[self.number].to_world(setting.middle(self.number)) - middle
+            offset = context.scene.bodies[self.number].to_world(context.middle(self.number)) - middle
             distance = float(np.linalg.norm(offset))
             return middle, (offset / distance if distance > 0 else np.array(constraints.UP)), distance
 
-        return setting.cached(self, find)
+        return context.cached(self, find)
 
-    def _placed(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor]:
+    def _placed(self, values: Values, context: FitContext) -> tuple[torch.Tensor, torch.Tensor]:
         """Translation and scale of the body. Differentiable: values."""
-        middle, start_direction, distance = self._start(setting)
-        body = setting.scene.bodies[self.number]
+        middle, start_direction, distance = self._start(context)
+        body = context.scene.bodies[self.number]
         factor = (_REACH * values["log_distance"]).exp()
         direction = constraints.turned_direction(start_direction, _REACH * values["turn"])
         scale = body.scale * factor
-        own_middle = setting.tensor(body.rotation_matrix() @ setting.middle(self.number))
-        return setting.tensor(middle) + distance * factor * direction - scale * own_middle, scale
+        own_middle = context.tensor(body.rotation_matrix() @ context.middle(self.number))
+        return context.tensor(middle) + distance * factor * direction - scale * own_middle, scale
 
-    def relocated(self, values: Values, setting: Setting, number: int) -> Values:
+    def relocated(self, values: Values, context: FitContext, number: int) -> Values:
         """The lamp in another direction above, as far away.
 
         Args:
             values: Of the lamp.
-            setting: Of the fit.
+            context: Of the fit.
             number: Of the direction, 0 to STARTS − 1; they repeat.
         """
-        _, start_direction, _ = self._start(setting)
+        _, start_direction, _ = self._start(context)
         above = fibonacci(2 * STARTS)[:, [0, 2, 1]]
         direction = above[above[:, 1] > 0][number % STARTS]
         sideways = constraints.perpendicular_basis([start_direction]) @ direction
         angle = np.arctan2(np.linalg.norm(sideways), direction @ start_direction)
         turn = angle / max(float(np.linalg.norm(sideways)), 1e-12) * sideways / _REACH
-        return {"turn": setting.tensor(turn), "log_distance": values["log_distance"].detach().clone()}
+        return {"turn": context.tensor(turn), "log_distance": values["log_distance"].detach().clone()}
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
-        world.translations[self.number], world.scales[self.number] = self._placed(values, setting)
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
+        world.translations[self.number], world.scales[self.number] = self._placed(values, context)
         world.moving.add(self.number)
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        translation, scale = (part.cpu().numpy() for part in self._placed(values, setting))
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
+        translation, scale = (part.cpu().numpy() for part in self._placed(values, context))
         fitted.change_body(self.number, translation=translation, scale=float(scale))
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:

@@ -10,7 +10,7 @@ from warpshadow import check
 from warpshadow.assets.basis import Basis, CellBasis, HarmonicBasis
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.inverse.free.base import Free, Values
-from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.maths.directions import check_count, fibonacci
 from warpshadow.maths.sh import check_order
 from warpshadow.scene.scene import Scene
@@ -65,22 +65,22 @@ class Light(Free):
         """The basis of the light."""
         return CellBasis(fibonacci(self.directions)) if self.order is None else HarmonicBasis(self.order)
 
-    def start(self, setting: Setting) -> Values:
-        radiance = self.basis.coefficients(setting.scene.light) / setting.unit
+    def start(self, context: FitContext) -> Values:
+        radiance = self.basis.coefficients(context.scene.light) / context.unit
         if isinstance(self.basis, CellBasis):
-            return {"log_radiance": setting.tensor(np.log(np.maximum(radiance, _MIN_RADIANCE)))}
-        return {"coefficients": setting.tensor(radiance / np.sqrt(4 * np.pi))}
+            return {"log_radiance": context.tensor(np.log(np.maximum(radiance, _MIN_RADIANCE)))}
+        return {"coefficients": context.tensor(radiance / np.sqrt(4 * np.pi))}
 
-    def coefficients(self, values: Values, setting: Setting) -> torch.Tensor:
+    def coefficients(self, values: Values, context: FitContext) -> torch.Tensor:
         """Light in the basis, linear RGB, [coefficient, 3]. Differentiable: values."""
         if isinstance(self.basis, CellBasis):
-            return values["log_radiance"].exp() * setting.unit
-        return values["coefficients"] * (setting.unit * np.sqrt(4 * np.pi))
+            return values["log_radiance"].exp() * context.unit
+        return values["coefficients"] * (context.unit * np.sqrt(4 * np.pi))
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
-        world.light = self.coefficients(values, setting)
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
+        world.light = self.coefficients(values, context)
 
-    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
+    def regularizer(self, values: Values, context: FitContext) -> torch.Tensor | None:
         """Penalize negative radiance, and differences between neighboring cells."""
         if isinstance(self.basis, CellBasis):
             first, second = neighboring_cells(self.basis.size)
@@ -89,12 +89,12 @@ class Light(Free):
         if not self.nonnegativity:
             return None
         basis_values = np.sqrt(4 * np.pi) * self.basis.functions(fibonacci(512))
-        radiance = setting.tensor(basis_values) @ values["coefficients"]
+        radiance = context.tensor(basis_values) @ values["coefficients"]
         return self.nonnegativity * torch.relu(-radiance).square().mean()
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         """Spherical harmonics stay; cells become a map, of the radius that the scene's light has."""
-        coefficients = self.coefficients(values, setting).cpu().numpy()
+        coefficients = self.coefficients(values, context).cpu().numpy()
         light: np.ndarray | EnvironmentMap = coefficients
         if isinstance(self.basis, CellBasis):
             light, before = self.basis.to_map(coefficients), fitted.scene.light

@@ -13,7 +13,7 @@ from warpshadow import check
 from warpshadow.inverse import constraints
 from warpshadow.inverse.free.base import PRIOR, Free, FreeOfBody, Values
 from warpshadow.inverse.free.pose import Pose
-from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.torch import rotation_matrices
 
@@ -77,26 +77,26 @@ class Plane(FreeOfBody):
         """The bodies that move: itself, and all that it carries."""
         return [self.number, *(body for body in self.carries if isinstance(body, int))]
 
-    def _start(self, setting: Setting) -> tuple[np.ndarray, np.ndarray, float]:
+    def _start(self, context: FitContext) -> tuple[np.ndarray, np.ndarray, float]:
         """The normal at the start, the point about which it tilts, and the unit of its height."""
-        return setting.cached(self, lambda: self._find_start(setting))
+        return context.cached(self, lambda: self._find_start(context))
 
-    def _find_start(self, setting: Setting) -> tuple[np.ndarray, np.ndarray, float]:
-        bodies = setting.scene.bodies
+    def _find_start(self, context: FitContext) -> tuple[np.ndarray, np.ndarray, float]:
+        bodies = context.scene.bodies
         others = [number for number in range(len(bodies)) if number != self.number] or [self.number]
         middles = [np.mean(bodies[number].world_mesh().bounds, axis=0) for number in others]
-        plane = constraints.plane_below(bodies[self.number], setting.cameras[0].eye, "body")
+        plane = constraints.plane_below(bodies[self.number], context.cameras[0].eye, "body")
         above = np.mean(middles, axis=0)
         foot = above - plane.normal * (plane.normal @ above - plane.offset)
-        return plane.normal, foot, float(np.mean([bodies[n].scale * setting.extent(n) for n in others]))
+        return plane.normal, foot, float(np.mean([bodies[n].scale * context.extent(n) for n in others]))
 
-    def start(self, setting: Setting) -> Values:
+    def start(self, context: FitContext) -> Values:
         """Plane of the scene, or the plane nearest to the points."""
         tilt, height = np.zeros(2), 0.0
         if self.points is not None:
             from scipy.spatial.transform import Rotation
 
-            normal, foot, unit = self._start(setting)
+            normal, foot, unit = self._start(context)
             points = np.asarray(self.points)
             middle = points.mean(axis=0)
             nearest = np.linalg.svd(points - middle)[2][-1]
@@ -104,43 +104,43 @@ class Plane(FreeOfBody):
             turn = Rotation.from_matrix(constraints.turn_onto(normal, nearest)).as_rotvec()
             tilt = constraints.perpendicular_basis([normal]) @ turn
             height = (nearest @ (middle - foot)) / (nearest @ normal) / unit
-        return {"tilt": setting.tensor(tilt), "height": setting.tensor(height)}
+        return {"tilt": context.tensor(tilt), "height": context.tensor(height)}
 
     def moved(
-        self, values: Values, setting: Setting, rotation: torch.Tensor, point: torch.Tensor
+        self, values: Values, context: FitContext, rotation: torch.Tensor, point: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Move a rotation and a point along with the plane. Differentiable: all but setting."""
-        normal, foot, unit = self._start(setting)
-        tangents = setting.tensor(constraints.perpendicular_basis([normal]))
+        """Move a rotation and a point along with the plane. Differentiable: all but context."""
+        normal, foot, unit = self._start(context)
+        tangents = context.tensor(constraints.perpendicular_basis([normal]))
         turn = rotation_matrices(tangents.T @ values["tilt"])
-        pivot = setting.tensor(foot)
-        return turn @ rotation, turn @ (point - pivot) + pivot + unit * values["height"] * setting.tensor(normal)
+        pivot = context.tensor(foot)
+        return turn @ rotation, turn @ (point - pivot) + pivot + unit * values["height"] * context.tensor(normal)
 
-    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
-        normal, foot, unit = self._start(setting)
+    def regularizer(self, values: Values, context: FitContext) -> torch.Tensor | None:
+        normal, foot, unit = self._start(context)
         squares = []
         if self.height is not None:
             squares.append((unit * values["height"] / self.height).square())
         if self.tilt is not None:
             squares.append((values["tilt"] / self.tilt).square().sum())
         if self.points is not None and self.deviation is not None:
-            turn, moved_foot = self.moved(values, setting, setting.tensor(np.eye(3)), setting.tensor(foot))
-            gaps = (setting.tensor(np.asarray(self.points)) - moved_foot) @ (turn @ setting.tensor(normal))
+            turn, moved_foot = self.moved(values, context, context.tensor(np.eye(3)), context.tensor(foot))
+            gaps = (context.tensor(np.asarray(self.points)) - moved_foot) @ (turn @ context.tensor(normal))
             squares.append((gaps / self.deviation).square().sum())
         return PRIOR * torch.stack(squares).sum() if squares else None
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
         for number in self._moving():
             world.rotations[number], world.translations[number] = self.moved(
-                values, setting, world.rotations[number], world.translations[number]
+                values, context, world.rotations[number], world.translations[number]
             )
             world.moving.add(number)
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         for number in self._moving():
             body = fitted.scene.bodies[number]
-            start = setting.tensor(body.rotation_matrix()), setting.tensor(body.translation)
-            rotation, translation = (part.cpu().numpy() for part in self.moved(values, setting, *start))
+            start = context.tensor(body.rotation_matrix()), context.tensor(body.translation)
+            rotation, translation = (part.cpu().numpy() for part in self.moved(values, context, *start))
             fitted.change_body(number, rotation=rotation, translation=translation)
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:

@@ -14,7 +14,7 @@ from warpshadow import check
 from warpshadow.inverse import constraints
 from warpshadow.inverse.constraints import PoseConstraint
 from warpshadow.inverse.free.base import PRIOR, FreeOfBody, Values
-from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.torch import rotation_matrices
@@ -130,20 +130,20 @@ class Pose(FreeOfBody):
             raise ValueError(f"stands_on: got {ground}, the body itself; expected another, such as the ground")
         constraints.onto_plane(constraints.plane_below(scene.bodies[ground], np.zeros(3)).normal, self.fixed)
 
-    def constraint(self, setting: Setting) -> PoseConstraint:
+    def constraint(self, context: FitContext) -> PoseConstraint:
         """The poses that are possible."""
-        return setting.cached(self, lambda: self._constraint(setting))
+        return context.cached(self, lambda: self._constraint(context))
 
-    def _constraint(self, setting: Setting) -> PoseConstraint:
-        body = setting.scene.bodies[self.number]
+    def _constraint(self, context: FitContext) -> PoseConstraint:
+        body = context.scene.bodies[self.number]
         rotation = body.rotation_matrix()
         axis = constraints.UP if self.upright else self.axis
         turns = np.eye(3) if axis is None else np.array([axis])
         fixed_axes = [np.eye(3)[constraints.AXES[coordinate]] for coordinate in self.fixed]
         if self.stands_on is None:
             return PoseConstraint(turns, constraints.perpendicular_basis(fixed_axes), rotation)
-        ground = setting.scene.bodies[setting.scene.body_number(self.stands_on, "stands_on")]
-        plane = constraints.plane_below(ground, self._start_middle(setting))
+        ground = context.scene.bodies[context.scene.body_number(self.stands_on, "stands_on")]
+        plane = constraints.plane_below(ground, self._start_middle(context))
         if self.resting != "free":
             turns = plane.normal[None]
         if self.tilt is not None:
@@ -154,11 +154,11 @@ class Pose(FreeOfBody):
         onto = constraints.onto_plane(plane.normal, self.fixed)
         return PoseConstraint(turns, shifts, rotation, plane, onto, constraints.hull_points(body.mesh))
 
-    def start(self, setting: Setting) -> Values:
-        possible = self.constraint(setting)
+    def start(self, context: FitContext) -> Values:
+        possible = self.constraint(context)
         turn = np.zeros(len(possible.turns)) if self.rotation == "axis-angle" else _NO_TURN[self.rotation]
-        values = {"turn": setting.tensor(turn), "shift": setting.tensor(np.zeros(len(possible.shifts)))}
-        return values | ({"log_scale": setting.tensor(0.0)} if self.scale else {})
+        values = {"turn": context.tensor(turn), "shift": context.tensor(np.zeros(len(possible.shifts)))}
+        return values | ({"log_scale": context.tensor(0.0)} if self.scale else {})
 
     def scattered(self, values: Values, number: int, generator: torch.Generator) -> Values:
         from scipy.spatial.transform import Rotation
@@ -179,60 +179,60 @@ class Pose(FreeOfBody):
             turned_vector = turn.apply(start.reshape(2, 3)).ravel()
         return copies | {"turn": torch.tensor(turned_vector, dtype=torch.float32, device=values["turn"].device)}
 
-    def _posed(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _posed(self, values: Values, context: FitContext) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotation, translation and scale of the body: it turns about its middle m, which moves by the shift."""
-        rotation, center, scale = self.moved(values, setting)
-        return rotation, center - scale * rotation @ setting.tensor(setting.middle(self.number)), scale
+        rotation, center, scale = self.moved(values, context)
+        return rotation, center - scale * rotation @ context.tensor(context.middle(self.number)), scale
 
-    def moved(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def moved(self, values: Values, context: FitContext) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotation, middle in the world, and scale of the body. Differentiable: values."""
-        body, possible = setting.scene.bodies[self.number], self.constraint(setting)
+        body, possible = context.scene.bodies[self.number], self.constraint(context)
         turn = possible.turn(values["turn"]) if self.rotation == "axis-angle" else values["turn"]
-        rotation = rotation_matrices(turn) @ setting.tensor(possible.rotation)
-        scale = setting.tensor(body.scale) * (values["log_scale"].exp() if self.scale else 1)
-        shift = body.scale * setting.extent(self.number) * possible.shift(values["shift"])
-        center = setting.tensor(self._start_middle(setting)) + shift
+        rotation = rotation_matrices(turn) @ context.tensor(possible.rotation)
+        scale = context.tensor(body.scale) * (values["log_scale"].exp() if self.scale else 1)
+        shift = body.scale * context.extent(self.number) * possible.shift(values["shift"])
+        center = context.tensor(self._start_middle(context)) + shift
         return (
             rotation,
-            possible.lower_onto_plane(center, rotation, scale, setting.tensor(setting.middle(self.number))),
+            possible.lower_onto_plane(center, rotation, scale, context.tensor(context.middle(self.number))),
             scale,
         )
 
-    def _start_middle(self, setting: Setting) -> np.ndarray:
+    def _start_middle(self, context: FitContext) -> np.ndarray:
         """Initial position of the body's middle in the world."""
-        return setting.scene.bodies[self.number].to_world(setting.middle(self.number))
+        return context.scene.bodies[self.number].to_world(context.middle(self.number))
 
-    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
-        body = setting.scene.bodies[self.number]
-        rotation, center, scale = self.moved(values, setting)
+    def regularizer(self, values: Values, context: FitContext) -> torch.Tensor | None:
+        body = context.scene.bodies[self.number]
+        rotation, center, scale = self.moved(values, context)
         squares = []
         if self.distance is not None:
             mean, deviation = self.distance
-            gap = (center - setting.tensor(setting.cameras[0].eye)).norm() - mean
+            gap = (center - context.tensor(context.cameras[0].eye)).norm() - mean
             squares.append((gap / deviation).square())
         if self.size is not None:
             mean, deviation = self.size
-            squares.append(((2 * setting.extent(self.number) * scale - mean) / deviation).square())
+            squares.append(((2 * context.extent(self.number) * scale - mean) / deviation).square())
         if self.tilt is not None:
-            possible = self.constraint(setting)
-            normal, level = setting.tensor(possible.turns[0]), setting.tensor(possible.turns[1:])
-            tilt = level @ (rotation @ setting.tensor(possible.rotation).T @ normal)  # its sine
+            possible = self.constraint(context)
+            normal, level = context.tensor(possible.turns[0]), context.tensor(possible.turns[1:])
+            tilt = level @ (rotation @ context.tensor(possible.rotation).T @ normal)  # its sine
             squares.append((tilt / self.tilt).square().sum())
         if self.covariance is not None:
-            turn = _rotation_vector(rotation @ setting.tensor(body.rotation_matrix()).T)
-            away = torch.cat([turn, center - setting.tensor(self._start_middle(setting))])
-            squares.append(away @ setting.tensor(np.linalg.inv(np.asarray(self.covariance, np.float64))) @ away)
+            turn = _rotation_vector(rotation @ context.tensor(body.rotation_matrix()).T)
+            away = torch.cat([turn, center - context.tensor(self._start_middle(context))])
+            squares.append(away @ context.tensor(np.linalg.inv(np.asarray(self.covariance, np.float64))) @ away)
         return PRIOR * torch.stack(squares).sum() if squares else None
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
-        rotation, translation, scale = self._posed(values, setting)
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
+        rotation, translation, scale = self._posed(values, context)
         world.rotations[self.number] = rotation
         world.translations[self.number] = translation
         world.scales[self.number] = scale
         world.moving.add(self.number)
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        rotation, translation, scale = (part.cpu().numpy() for part in self._posed(values, setting))
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
+        rotation, translation, scale = (part.cpu().numpy() for part in self._posed(values, context))
         fitted.change_body(self.number, rotation=rotation, translation=translation, scale=float(scale))
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:

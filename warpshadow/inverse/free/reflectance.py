@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.inverse.free.base import FreeOfBody, Values
-from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene
@@ -99,22 +99,22 @@ class FreeOfSurface(FreeOfBody):
         """The body's values, [1, channel] or [vertex, channel], or [height, width, channel]."""
         raise NotImplementedError
 
-    def _unit(self, setting: Setting) -> float:
+    def _unit(self, context: FitContext) -> float:
         """Body's value that counts as 1."""
         return 1.0
 
-    def start(self, setting: Setting) -> Values:
+    def start(self, context: FitContext) -> Values:
         """The body's values; their mean, where one is free."""
-        body = setting.scene.bodies[self.number]
-        rows = self.rows(body) / self._unit(setting)
+        body = context.scene.bodies[self.number]
+        rows = self.rows(body) / self._unit(context)
         if self.per_vertex:
-            return {self.value_key: setting.tensor(np.broadcast_to(rows, (body.mesh.vertex_count, rows.shape[1])))}
-        mean = setting.tensor(rows.reshape(-1, rows.shape[-1]).mean(axis=0)[None])
+            return {self.value_key: context.tensor(np.broadcast_to(rows, (body.mesh.vertex_count, rows.shape[1])))}
+        mean = context.tensor(rows.reshape(-1, rows.shape[-1]).mean(axis=0)[None])
         if self.size is None:
             return {self.value_key: mean}
-        return {self.value_key: resized(setting.tensor(rows) if rows.ndim == 3 else mean[None], self.size)}
+        return {self.value_key: resized(context.tensor(rows) if rows.ndim == 3 else mean[None], self.size)}
 
-    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
+    def regularizer(self, values: Values, context: FitContext) -> torch.Tensor | None:
         return self.smoothness * variation(values[self.value_key]) if self.smoothness else None
 
 
@@ -140,20 +140,20 @@ class Albedo(FreeOfBody):
         if scene.bodies[self.number].texture is not None:
             raise ValueError(f"body: got {self.number}, which has a texture; expected one without, or Texture")
 
-    def start(self, setting: Setting) -> Values:
+    def start(self, context: FitContext) -> Values:
         """The body's albedo; the mean of its vertices' colors, where one is free."""
-        body = setting.scene.bodies[self.number]
+        body = context.scene.bodies[self.number]
         if self.per_vertex:
-            return {"color": setting.tensor(np.broadcast_to(body.albedo, (body.mesh.vertex_count, 3)))}
-        return {"color": setting.tensor(_one_color(body)[None])}
+            return {"color": context.tensor(np.broadcast_to(body.albedo, (body.mesh.vertex_count, 3)))}
+        return {"color": context.tensor(_one_color(body)[None])}
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
         world.albedo[self.number] = values["color"]
 
     def project(self, values: Values) -> None:
         values["color"].clamp_(0, 1)
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         color = values["color"].cpu().numpy()
         fitted.change_body(self.number, albedo=color if self.per_vertex else color[0])
 
@@ -197,12 +197,12 @@ class Texture(FreeOfBody):
     def check_scene(self, scene: Scene) -> None:
         check_uvs(self.number, scene)
 
-    def start(self, setting: Setting) -> Values:
+    def start(self, context: FitContext) -> Values:
         """The body's texture, or its color: the mean of its vertices' colors, where each has one."""
-        body = setting.scene.bodies[self.number]
+        body = context.scene.bodies[self.number]
         image = _one_color(body)[None, None] if body.texture is None else body.texture
         size = self.size or ((256, 256) if body.texture is None else image.shape[:2])
-        texels = resized(setting.tensor(image), size)
+        texels = resized(context.tensor(image), size)
         return {"texels": texels} | ({"palette": self._first_colors(texels)} if self.palette else {})
 
     def _first_colors(self, texels: torch.Tensor) -> torch.Tensor:
@@ -214,10 +214,10 @@ class Texture(FreeOfBody):
         ranked_colors = flat[flat.sum(dim=1).argsort()]
         return ranked_colors[(shares * len(flat)).long()]
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
         world.textures[self.number] = values["texels"]
 
-    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
+    def regularizer(self, values: Values, context: FitContext) -> torch.Tensor | None:
         texels = values["texels"]
         energies = []
         if self.smoothness:
@@ -235,10 +235,10 @@ class Texture(FreeOfBody):
         for colors in values.values():
             colors.clamp_(0, 1)
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         """Cover the body; texels that no view sees get the color of the nearest one that is seen."""
         texels = values["texels"].cpu().numpy()
         fitted.change_body(self.number, texture=texels)
         unshadowed_scene = replace(fitted.scene, visibility=Visibility(method="none"), bounces=0)
-        renderer = SceneRenderer(unshadowed_scene, cameras=fitted.cameras, device=str(setting.device))
+        renderer = SceneRenderer(unshadowed_scene, cameras=fitted.cameras, device=str(context.device))
         fitted.change_body(self.number, texture=fill_unseen(texels, renderer.seen_texels(self.number)))

@@ -8,7 +8,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.inverse.free.base import FreeOfBody, Values
-from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import SPHERE_METHODS
@@ -62,42 +62,42 @@ class Deformation(FreeOfBody):
         if self.count >= nodes:
             raise ValueError(f"count: got {self.count} for {nodes} nodes, the body's spheres, expected fewer than them")
 
-    def start(self, setting: Setting) -> Values:
-        nodes = setting.graph(self.number, self.count).node_positions.shape[0]
+    def start(self, context: FitContext) -> Values:
+        nodes = context.graph(self.number, self.count).node_positions.shape[0]
         sizes = {"turns": 3, "shifts": 3, "stretches": 6}
-        return {key: setting.tensor(np.zeros((nodes, size))) for key, size in sizes.items()}
+        return {key: context.tensor(np.zeros((nodes, size))) for key, size in sizes.items()}
 
-    def _moved_nodes(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _moved_nodes(self, values: Values, context: FitContext) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Matrices [node, 3, 3] and translations [node, 3] in the body's own space, and stretches [node, 3, 3]."""
-        smoothing = setting.smoothing(self.number, self.count, self.smoothness)
+        smoothing = context.smoothing(self.number, self.count, self.smoothness)
         turns, shifts, entries = (smoothing @ values[key] for key in ("turns", "shifts", "stretches"))
         stretches = (_STRETCH_UNIT * entries[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]]).reshape(-1, 3, 3)
         rotations = rotation_matrices(turns)
-        return rotations + rotations @ stretches, setting.extent(self.number) * shifts, stretches
+        return rotations + rotations @ stretches, context.extent(self.number) * shifts, stretches
 
-    def _deformed(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor]:
+    def _deformed(self, values: Values, context: FitContext) -> tuple[torch.Tensor, torch.Tensor]:
         """Vertices and centers in the body's own space, with a batch of 1."""
-        graph = setting.graph(self.number, self.count)
-        matrices, shifts, _ = self._moved_nodes(values, setting)
+        graph = context.graph(self.number, self.count)
+        matrices, shifts, _ = self._moved_nodes(values, context)
         points = apply(graph.points, matrices[None], shifts[None], dtypes=(wp.mat33, wp.vec3))
         return points, apply(graph.centers, shifts[None], dtypes=(wp.vec3,))
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
-        points, centers = self._deformed(values, setting)
-        has_spheres = len(setting.spheres(self.number)) > 0  # without shadows there are nodes, but no spheres
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
+        points, centers = self._deformed(values, context)
+        has_spheres = len(context.spheres(self.number)) > 0  # without shadows there are nodes, but no spheres
         world.rest = world.renderer.deformed(self.number, points, centers if has_spheres else None, rest=world.rest)
         world.moving.add(self.number)
 
-    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
+    def regularizer(self, values: Values, context: FitContext) -> torch.Tensor | None:
         """Differences between where neighboring nodes take each other, and stretches."""
-        graph = setting.graph(self.number, self.count)
-        matrices, shifts, stretches = self._moved_nodes(values, setting)
+        graph = context.graph(self.number, self.count)
+        matrices, shifts, stretches = self._moved_nodes(values, context)
         gaps = apply(graph.rigidity, matrices[None], shifts[None], dtypes=(wp.mat33, wp.vec3))[0]
-        gaps = gaps / (graph.neighbors.shape[0] * setting.extent(self.number) ** 2)
+        gaps = gaps / (graph.neighbors.shape[0] * context.extent(self.number) ** 2)
         return self.rigidity * gaps + self.firmness * stretches.square().sum((1, 2)).mean()
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        points, centers = (part[0].cpu().numpy() for part in self._deformed(values, setting))
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
+        points, centers = (part[0].cpu().numpy() for part in self._deformed(values, context))
         mesh = replace(fitted.scene.bodies[self.number].mesh, positions=points)
         fitted.change_body(self.number, mesh=mesh, self_shadows="spheres")  # as in the images of the fit
         spheres = fitted.spheres(self.number)
@@ -128,18 +128,18 @@ class Radii(FreeOfBody):
         if scene.visibility.method not in SPHERE_METHODS or not _sphere_count(scene.bodies[self.number]):
             raise ValueError(f"body: got {self.number}, which has no spheres; expected one that casts a shadow")
 
-    def start(self, setting: Setting) -> Values:
-        return {"log": setting.tensor(np.zeros(len(setting.spheres(self.number))))}
+    def start(self, context: FitContext) -> Values:
+        return {"log": context.tensor(np.zeros(len(context.spheres(self.number))))}
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
-        radii = setting.tensor(setting.spheres(self.number).radii) * values["log"].exp()
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
+        radii = context.tensor(context.spheres(self.number).radii) * values["log"].exp()
         world.rest = world.renderer.deformed(self.number, radii=radii, rest=world.rest)
         world.moving.add(self.number)
 
-    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor | None:
+    def regularizer(self, values: Values, context: FitContext) -> torch.Tensor | None:
         return self.persistence * values["log"].square().mean() if self.persistence else None
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         spheres = fitted.spheres(self.number)
         radii = spheres.radii * values["log"].exp().cpu().numpy()
         fitted.change_body(self.number, blockers=Spheres(spheres.centers, radii), self_shadows="spheres")

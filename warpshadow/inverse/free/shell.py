@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from warpshadow import check
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.inverse.free.base import Free, Values
-from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.scene.scene import Scene
 
 _REACH = 4.0  # logarithm of the gap between bodies and shell, for a value of 1
@@ -38,34 +38,34 @@ class Shell(Free):
                 "EnvironmentMap(…, radius=…)"
             )
 
-    def start(self, setting: Setting) -> Values:
-        return {"log_gap": setting.tensor(0.0)}
+    def start(self, context: FitContext) -> Values:
+        return {"log_gap": context.tensor(0.0)}
 
-    def _start(self, setting: Setting) -> tuple[np.ndarray, float, float]:
+    def _start(self, context: FitContext) -> tuple[np.ndarray, float, float]:
         """The center, the smallest radius, and the gap between that and the radius in the scene."""
 
         def find() -> tuple[np.ndarray, float, float]:
-            assert setting.scene.shell is not None
-            *center, radius = setting.scene.shell.tolist()
-            points = np.concatenate([body.world_points() for body in setting.scene.bodies])
+            assert context.scene.shell is not None
+            *center, radius = context.scene.shell.tolist()
+            points = np.concatenate([body.world_points() for body in context.scene.bodies])
             farthest = float(np.linalg.norm(points - center, axis=1).max())
             smallest = min((1 + _CLEARANCE) * farthest, radius)
             return np.array(center), smallest, max(radius - smallest, _MIN_GAP * farthest)
 
-        return setting.cached(self, find)
+        return context.cached(self, find)
 
-    def shell(self, values: Values, setting: Setting) -> torch.Tensor:
+    def shell(self, values: Values, context: FitContext) -> torch.Tensor:
         """Center and radius [scene units], shape [4]. Differentiable: values."""
-        center, smallest, gap = self._start(setting)
+        center, smallest, gap = self._start(context)
         radius = smallest + gap * (_REACH * values["log_gap"]).exp()
-        return torch.cat([setting.tensor(center), radius.reshape(1)])
+        return torch.cat([context.tensor(center), radius.reshape(1)])
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
-        world.shell = self.shell(values, setting)
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
+        world.shell = self.shell(values, context)
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         assert isinstance(fitted.scene.light, EnvironmentMap)
-        light = replace(fitted.scene.light, radius=float(self.shell(values, setting)[3]))
+        light = replace(fitted.scene.light, radius=float(self.shell(values, context)[3]))
         fitted.scene = replace(fitted.scene, light=light)
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:

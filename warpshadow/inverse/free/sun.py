@@ -13,7 +13,7 @@ from warpshadow.assets.basis import CellBasis
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.inverse import constraints
 from warpshadow.inverse.free.base import Free, Values
-from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.maths.directions import check_count, fibonacci
 from warpshadow.scene.scene import Scene
 
@@ -90,12 +90,12 @@ class Sun(Free):
         """Angular radius [degrees] of the disc that spreads as a point's cells do: 8.8° of 512 cells."""
         return float(np.degrees(2 * self._spacing * np.sqrt(_WEIGHT_WIDTH**2 + 1 / (4 * np.pi))))
 
-    def start(self, setting: Setting) -> Values:
+    def start(self, context: FitContext) -> Values:
         """The given sun, or one of one and a half times the resolution if that is larger."""
         return {
-            "turn": setting.tensor(np.zeros(2)),
-            "log_irradiance": setting.tensor(np.zeros(3)),
-            "log_radius": setting.tensor(0.0),
+            "turn": context.tensor(np.zeros(2)),
+            "log_irradiance": context.tensor(np.zeros(3)),
+            "log_radius": context.tensor(0.0),
         }
 
     @property
@@ -107,7 +107,7 @@ class Sun(Free):
         largest = max(_LARGEST, self._first_radius)
         values["log_radius"].clamp_(*(float(np.log(size / self._first_radius)) for size in (self.resolution, largest)))
 
-    def _sun(self, values: Values, setting: Setting) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _sun(self, values: Values, context: FitContext) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Direction [3], irradiance [3], and angular radius [radians], at least the resolution.
 
         Differentiable: values.
@@ -119,9 +119,9 @@ class Sun(Free):
         radius = np.radians(self._first_radius) * values["log_radius"].double().exp()
         return direction / direction.norm(), strength, radius
 
-    def coefficients(self, values: Values, setting: Setting) -> torch.Tensor:
+    def coefficients(self, values: Values, context: FitContext) -> torch.Tensor:
         """Its light in cells, linear RGB, [cell, 3]. Differentiable: values."""
-        direction, strength, radius = self._sun(values, setting)
+        direction, strength, radius = self._sun(values, context)
         cells = torch.tensor(self.basis.directions).to(direction)
         variance = radius**2 / 4 - self._spacing**2 / (4 * np.pi)  # of the weights: cells are wide themselves
         weights = _weights(direction, variance, cells)
@@ -129,14 +129,14 @@ class Sun(Free):
         light = self.directions / (4 * np.pi) * (weights / share)[:, None] * strength
         return light.to(values["turn"])
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
-        of_map = setting.cached(
-            (self.name, "map"), lambda: setting.tensor(self.basis.coefficients(setting.scene.light))
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
+        of_map = context.cached(
+            (self.name, "map"), lambda: context.tensor(self.basis.coefficients(context.scene.light))
         )
-        world.light = of_map + self.coefficients(values, setting)
+        world.light = of_map + self.coefficients(values, context)
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
-        direction, strength, radius = (part.cpu().numpy() for part in self._sun(values, setting))
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
+        direction, strength, radius = (part.cpu().numpy() for part in self._sun(values, context))
         degrees = float(np.degrees(radius))
         if degrees < _UNRESOLVED * self.resolution:
             degrees = min(self.angular_radius, self.resolution)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.inverse.free.base import PRIOR, Free, Values
-from warpshadow.inverse.world import FittedScene, Setting, World
+from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.torch import rotation_matrices
 
 
@@ -35,10 +35,10 @@ class Exposure(Free):
         if self.reference is not None:
             check.integer("reference", self.reference, minimum=0)
 
-    def start(self, setting: Setting) -> Values:
-        views = len(setting.cameras)
-        values = {"log": setting.tensor(np.zeros(views))}
-        return values | ({"log_white": setting.tensor(np.zeros((views, 2)))} if self.white_balance else {})
+    def start(self, context: FitContext) -> Values:
+        views = len(context.cameras)
+        values = {"log": context.tensor(np.zeros(views))}
+        return values | ({"log_white": context.tensor(np.zeros((views, 2)))} if self.white_balance else {})
 
     def _gains(self, values: Values) -> torch.Tensor:
         """Gains of red, green and blue, [view, 3]; or of all, [view, 1]."""
@@ -54,10 +54,10 @@ class Exposure(Free):
             is_free[self.reference] = 0
         return (is_free * logarithms).exp()
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
         world.exposures = self._factors(values["log"])[:, None] * self._gains(values)
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         fitted.exposures = self._factors(values["log"]).tolist()
         if self.white_balance:
             fitted.white_balances = [tuple(gains) for gains in self._gains(values).tolist()]
@@ -84,17 +84,17 @@ class OutlineOffset(Free):
     def __post_init__(self) -> None:
         check.positive("deviation", self.deviation)
 
-    def start(self, setting: Setting) -> Values:
-        return {"offset": setting.tensor(np.zeros(len(setting.cameras)))}
+    def start(self, context: FitContext) -> Values:
+        return {"offset": context.tensor(np.zeros(len(context.cameras)))}
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
         """Move the outlines; values are in standard deviations."""
         world.outline_offsets = values["offset"] * self.deviation
 
-    def regularizer(self, values: Values, setting: Setting) -> torch.Tensor:
+    def regularizer(self, values: Values, context: FitContext) -> torch.Tensor:
         return PRIOR * values["offset"].square().sum()
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         fitted.outline_offsets = (values["offset"] * self.deviation).tolist()
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
@@ -118,32 +118,32 @@ class CameraPose(Free):
     def __post_init__(self) -> None:
         check.flag("focal", self.focal)
 
-    def start(self, setting: Setting) -> Values:
-        views = len(setting.cameras)
-        values = {"turn": setting.tensor(np.zeros((views, 3))), "shift": setting.tensor(np.zeros((views, 3)))}
-        return values | ({"log_focal": setting.tensor(np.zeros(views))} if self.focal else {})
+    def start(self, context: FitContext) -> Values:
+        views = len(context.cameras)
+        values = {"turn": context.tensor(np.zeros((views, 3))), "shift": context.tensor(np.zeros((views, 3)))}
+        return values | ({"log_focal": context.tensor(np.zeros(views))} if self.focal else {})
 
     def _posed(
-        self, values: Values, setting: Setting, cameras: tuple[Camera, ...]
+        self, values: Values, context: FitContext, cameras: tuple[Camera, ...]
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """R, t and K of the views; shifts of the eye are in units of its distance from the scene."""
-        rotations = rotation_matrices(values["turn"]) @ setting.tensor([camera.rotation for camera in cameras])
-        eyes = setting.tensor([camera.eye for camera in cameras])
-        moved_eyes = eyes + setting.tensor(setting.distances) * values["shift"]
-        intrinsics = setting.tensor([camera.intrinsics for camera in cameras])
+        rotations = rotation_matrices(values["turn"]) @ context.tensor([camera.rotation for camera in cameras])
+        eyes = context.tensor([camera.eye for camera in cameras])
+        moved_eyes = eyes + context.tensor(context.distances) * values["shift"]
+        intrinsics = context.tensor([camera.intrinsics for camera in cameras])
         if self.focal:
             zoom = torch.ones_like(intrinsics)
             zoom[:, :2, :2] = values["log_focal"].exp()[:, None, None]
             intrinsics = intrinsics * zoom
         return rotations, -(rotations @ moved_eyes[..., None])[..., 0], intrinsics
 
-    def apply(self, values: Values, setting: Setting, world: World) -> None:
-        rotations, translations, intrinsics = self._posed(values, setting, world.cameras)
+    def apply(self, values: Values, context: FitContext, world: World) -> None:
+        rotations, translations, intrinsics = self._posed(values, context, world.cameras)
         world.clip_matrices = world.renderer.clip_matrices(rotations, translations, intrinsics)
 
-    def export(self, values: Values, setting: Setting, fitted: FittedScene) -> None:
+    def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         rotations, translations, intrinsics = (
-            part.cpu().numpy().astype(np.float64) for part in self._posed(values, setting, setting.cameras)
+            part.cpu().numpy().astype(np.float64) for part in self._posed(values, context, context.cameras)
         )
         fitted.cameras = [
             replace(camera, rotation=rotations[view], translation=translations[view], intrinsics=intrinsics[view])

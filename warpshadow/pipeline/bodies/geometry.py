@@ -87,21 +87,21 @@ def as_geometry(name: str, value: object) -> Geometry:
     return Geometry(*value)
 
 
-def splice(whole: wp.array, runs: Sequence[tuple[int, int]], part_of: Callable[[int, int], wp.array]) -> wp.array:
+def splice(whole: wp.array, ranges: Sequence[tuple[int, int]], part_of: Callable[[int, int], wp.array]) -> wp.array:
     """Replace ranges of items of a whole array by parts.
 
     Args:
         whole: Shape [batch, item].
-        runs: Where each range begins and ends, rising.
+        ranges: Where each range begins and ends, rising.
         part_of: Returns the replacement of a range, shape [batch, item], given its begin and end.
     Returns:
         Shape [batch, item], memory of its own; batches of 1 serve every instance of the others.
     Differentiable: whole, where no part replaces it, and the parts.
     """
-    pieces, last = [] if runs else [whole], 0
-    for first, end in runs:
+    pieces, last = [] if ranges else [whole], 0
+    for first, end in ranges:
         pieces += [whole[:, last:first]] if first > last else []
         pieces.append(part_of(first, end))
         last = end
-    pieces += [whole[:, last:]] if runs and last < whole.shape[1] else []
+    pieces += [whole[:, last:]] if ranges and last < whole.shape[1] else []
     return concatenate(pieces, [piece.shape[1] for piece in pieces])

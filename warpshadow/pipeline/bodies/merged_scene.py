@@ -97,7 +97,7 @@ class MergedScene:
         return self._array(np.tile(self.faces.numpy(), (2, 1)), wp.vec3i)
 
     @functools.cached_property
-    def edges(self) -> wp.array:
+    def face_neighbors(self) -> wp.array:
         """Face across each edge, vec3i of shape [face]: :func:`warpshadow.maths.adjacency.edge_neighbors`."""
         parts = [body.mesh.surface.neighbors for body in self.scene.bodies]
         moved = [
@@ -327,22 +327,22 @@ class MergedScene:
             arrays = poses.placed(rest.positions, self._vertex_bodies, *spheres)
             return Geometry(*arrays, rotations=turned, deformed=rest.deformed)
         bodies = {*numbers, *rest.moving}
-        vertices, sphere_runs = self.runs(self.first_vertex, bodies), self.runs(self.first_sphere, bodies)
+        vertices, sphere_ranges = self.ranges_of(self.first_vertex, bodies), self.ranges_of(self.first_sphere, bodies)
         static = self.scene_geometry
         moved = {
             (a, b): poses.spheres(rest.centers[:, a:b], rest.radii[:, a:b], self._sphere_bodies[a:b])
-            for a, b in sphere_runs
+            for a, b in sphere_ranges
         }
         if turned is not None:
             assert static.rotations is not None
-            every, given_rotations = self.runs(np.arange(len(self.scene.bodies) + 1), bodies), turned
+            every, given_rotations = self.ranges_of(np.arange(len(self.scene.bodies) + 1), bodies), turned
             turned = splice(static.rotations, every, lambda a, b: given_rotations[:, a:b])
         return Geometry(
             splice(
                 static.positions, vertices, lambda a, b: poses.points(rest.positions[:, a:b], self._vertex_bodies[a:b])
             ),
-            splice(static.centers, sphere_runs, lambda a, b: moved[a, b][0]),
-            splice(static.radii, sphere_runs, lambda a, b: moved[a, b][1]),
+            splice(static.centers, sphere_ranges, lambda a, b: moved[a, b][0]),
+            splice(static.radii, sphere_ranges, lambda a, b: moved[a, b][1]),
             moving=tuple(bodies),
             rotations=turned,
             deformed=rest.deformed,
@@ -356,8 +356,8 @@ class MergedScene:
         """Cut some bodies, in rising order, out of a geometry of all. Differentiable in it."""
 
         def items(array: wp.array, starts: np.ndarray) -> wp.array:
-            runs = self.runs(starts, bodies)
-            return concatenate([array[:, first:end] for first, end in runs], [end - first for first, end in runs])
+            ranges = self.ranges_of(starts, bodies)
+            return concatenate([array[:, first:end] for first, end in ranges], [end - first for first, end in ranges])
 
         centers, radii = self.spheres_of(bodies, (geometry.centers, geometry.radii))
         every, turned = np.arange(len(self.scene.bodies) + 1), geometry.rotations
@@ -371,14 +371,14 @@ class MergedScene:
 
     def spheres_of(self, bodies: Collection[int], spheres: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:
         """Centers and radii of the spheres of some bodies, from those of all. Differentiable: spheres."""
-        runs = self.runs(self.first_sphere, bodies)
-        if runs == [(0, spheres[1].shape[1])]:
+        ranges = self.ranges_of(self.first_sphere, bodies)
+        if ranges == [(0, spheres[1].shape[1])]:
             return spheres
-        if not runs:
+        if not ranges:
             centers, radii = (empty((1, 0), dtype=array.dtype, device=array.device) for array in spheres)
             return centers, radii
-        counts = [end - first for first, end in runs]
-        centers, radii = (concatenate([array[:, first:end] for first, end in runs], counts) for array in spheres)
+        counts = [end - first for first, end in ranges]
+        centers, radii = (concatenate([array[:, first:end] for first, end in ranges], counts) for array in spheres)
         return centers, radii
 
     def spheres_among(self, bodies: Sequence[int], body: int | None) -> tuple[int, int]:
@@ -390,7 +390,7 @@ class MergedScene:
         return first, first + int(counts[body])
 
     @staticmethod
-    def runs(starts: np.ndarray, bodies: Collection[int]) -> list[tuple[int, int]]:
+    def ranges_of(starts: np.ndarray, bodies: Collection[int]) -> list[tuple[int, int]]:
         """Ranges of the items of some bodies; consecutive ranges are joined, empty ones left out.
 
         Args:
@@ -398,20 +398,20 @@ class MergedScene:
                 or :attr:`first_face`.
             bodies: The bodies, from 0.
         """
-        runs: list[tuple[int, int]] = []
+        ranges: list[tuple[int, int]] = []
         for first, end in ((int(starts[number]), int(starts[number + 1])) for number in sorted(bodies)):
-            if runs and runs[-1][1] == first:
-                runs[-1] = runs[-1][0], end
+            if ranges and ranges[-1][1] == first:
+                ranges[-1] = ranges[-1][0], end
             elif end > first:
-                runs.append((first, end))
-        return runs
+                ranges.append((first, end))
+        return ranges
 
     @property
-    def casting(self) -> list[int]:
+    def shadow_casters(self) -> list[int]:
         """Bodies that cast shadows, from 0."""
         return [number for number, body in enumerate(self.scene.bodies) if body.casts_shadow]
 
-    def casting_mesh(self, positions: wp.array, bodies: Collection[int] | None = None) -> wp.Mesh | None:
+    def blocker_mesh(self, positions: wp.array, bodies: Collection[int] | None = None) -> wp.Mesh | None:
         """Build the mesh for rays: the faces of bodies that cast shadows.
 
         Args:
@@ -420,8 +420,8 @@ class MergedScene:
         Returns:
             None where no such body casts a shadow.
         """
-        casting = [number for number in self.casting if bodies is None or number in bodies]
-        return self._mesh(positions, np.isin(self.body_of_face, casting)) if casting else None
+        casters = [number for number in self.shadow_casters if bodies is None or number in bodies]
+        return self._mesh(positions, np.isin(self.body_of_face, casters)) if casters else None
 
     def mesh(self, positions: wp.array) -> wp.Mesh:
         """Make the mesh of all bodies.

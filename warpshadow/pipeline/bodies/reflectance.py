@@ -113,9 +113,9 @@ class Materials:
     def __init__(self, merged_scene: MergedScene, inputs: dict[str, Input]):
         self.merged_scene, self._inputs, self._of_scene = merged_scene, inputs, inputs
         self.textures_of: dict[str, BodyTextures] = {}
-        self._wire(inputs)
+        self._make_nodes(inputs)
 
-    def _wire(self, changed: Collection[str]) -> None:
+    def _make_nodes(self, changed: Collection[str]) -> None:
         """Make the nodes of inputs that changed."""
         self.albedo, self.textures = self._inputs["albedo"], self._inputs["textures"]
         self.roughness, self.emission = self._inputs.get("roughness"), self._inputs.get("emission")
@@ -189,7 +189,7 @@ class Materials:
             return self
         materials = copy.copy(self)
         materials._inputs = self._inputs | changed
-        materials._wire(changed)
+        materials._make_nodes(changed)
         return materials
 
     def _check(self, name: str, number: int, array: wp.array) -> None:

@@ -170,13 +170,13 @@ class SelfVisibility:
                 whole = wp.Mesh(points.flatten(), from_numpy(faces.ravel(), dtype=wp.int32, device=device))
                 return find_probes(positions, normals, faces, longest, functools.partial(find_buried, whole))
 
-            self._probes[body] = self._of_mesh(body, "probes", find)
+            self._probes[body] = self._cached_by_mesh(body, "probes", find)
         return self._probes[body]
 
-    def _of_mesh(self, body: int, what: str, find: Callable[[], Found]) -> Found:
+    def _cached_by_mesh(self, body: int, name: str, find: Callable[[], Found]) -> Found:
         """Self-visibility of a body's mesh, shared by all renderers, computed at first use."""
         cached: dict = _OF_MESHES.setdefault(self._merged_scene.scene.bodies[body].mesh, {})
-        key = what, bool(self._samples_receive[body]), self._merged_scene.device.alias
+        key = name, bool(self._samples_receive[body]), self._merged_scene.device.alias
         if key not in cached:
             cached[key] = find()
         return cached[key]
@@ -247,12 +247,12 @@ class SelfVisibility:
             at = (from_numpy(values, dtype=wp.vec3, device=self._merged_scene.device) for values in (places, normals))
             return RayProbes(self._tree(body), *at)
 
-        return self._of_mesh(body, "ray probes", find)
+        return self._cached_by_mesh(body, "ray probes", find)
 
     def _tree(self, body: int) -> FaceTree:
         faces = self._merged_scene.scene.bodies[body].mesh.surface.faces
         build = functools.partial(build_face_tree, self.probes(body).positions, faces, self._merged_scene.device)
-        return self._of_mesh(body, "tree", build)
+        return self._cached_by_mesh(body, "tree", build)
 
     def turned_lobes(self, bodies: tuple[int, ...], rotations: wp.array, order: int) -> dict[int, SelfVisibilityLobes]:
         """The lobes of bodies in bands of spherical harmonics, and how they are turned. Differentiable: rotations."""
@@ -291,7 +291,7 @@ class SelfVisibility:
     def rows(self, body: int) -> VisibilityRows:
         """Self-visibility of the probes of a body: in memory, on disk, or traced."""
         if body not in self._rows:
-            self._rows[body] = self._of_mesh(body, "rows", lambda: self._find_rows(body))
+            self._rows[body] = self._cached_by_mesh(body, "rows", lambda: self._find_rows(body))
         return self._rows[body]
 
     def _announce(self, bodies: tuple[int, ...]) -> None:

@@ -87,7 +87,7 @@ class OutgoingRadiance:
         return find_texels(self.radiosity, self.patch_weights, self.proxies.planes.blockers)
 
 
-class Gathering:
+class BounceGatherer:
     """Gather at receivers the light that patches send: G.
 
     Args:
@@ -95,11 +95,11 @@ class Gathering:
         senders: The bodies whose patches send light.
         self_form_factors: Form factors of bodies for themselves.
         item_text: Number of receivers, in words.
-        suffix: Ends the names of its stages.
+        suffix: Ends the names of its rows.
         why_not: Why nobody asks for it, in words; empty if somebody does.
         only_others: Leave out light from a body to itself.
     Attributes:
-        stages: Its parts.
+        rows: Its rows of ``explain``.
     """
 
     def __init__(
@@ -121,22 +121,22 @@ class Gathering:
             "" if any(sphere_counts[body] for body in nonplanar_bodies) else "nothing that reflects has spheres",
         )
         names = "self light", "plane light", "sphere light"
-        stages = tuple(
+        rows = tuple(
             ExplainRow(f"{name}{suffix}", item_text, why_not or why) for name, why in zip(names, idle, strict=True)
         )
         functions = self._from_itself, self._from_planes, self._from_spheres
         first = 1 if only_others else 0
-        self.stages, self._functions = stages[first:], functions[first:]
+        self.rows, self._functions = rows[first:], functions[first:]
 
     def add_bounced(self, node: Node, call: Call, portion: PortionForBounces, outgoing: OutgoingRadiance) -> wp.array:
         """Add bounced light to direct light of a portion, by each path: its own body, planes, spheres.
 
-        ``node`` has the stages. The result is vec3 of shape [batch, receiver].
+        ``node`` has the rows. The result is vec3 of shape [batch, receiver].
         """
         light = portion.direct
-        for stage, function in zip(self.stages, self._functions, strict=True):
-            if not stage.idle:
-                with node.timed(call, stage):
+        for row, function in zip(self.rows, self._functions, strict=True):
+            if not row.idle:
+                with node.timed(call, row):
                     light = function(portion.group, portion.transmittance, outgoing, light)
         return light
 

@@ -21,7 +21,7 @@ import warp as wp
 from warpshadow.device.batch import cut
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.bounces.cell_transmittance import find_cell_transmittance
-from warpshadow.pipeline.bounces.gathering import ALL_FLAT, Gathering, OutgoingRadiance, PortionForBounces
+from warpshadow.pipeline.bounces.gathering import ALL_FLAT, BounceGatherer, OutgoingRadiance, PortionForBounces
 from warpshadow.pipeline.bounces.patches import OF_PATCH_SAMPLES, ScenePatches, Senders, lit_patch_samples
 from warpshadow.pipeline.bounces.proxies import PlacedProxies, Proxies
 from warpshadow.pipeline.bounces.repeated import SELF_BOUNCES, after_bounces
@@ -78,7 +78,7 @@ class DirectLightNode(Node):
         item_text: Number of receivers, in words.
         suffix: Ends the name of its stage.
         others: More that it depends on.
-        stages: Further ones, as for :class:`Node`.
+        rows: Further ones, as for :class:`Node`.
     """
 
     def __init__(
@@ -88,13 +88,13 @@ class DirectLightNode(Node):
         item_text: str | Callable[[], str],
         suffix: str = "",
         others: tuple[Node | None, ...] = (),
-        stages: tuple[ExplainRow, ...] = (),
+        rows: tuple[ExplainRow, ...] = (),
     ):
         self._visibility = visibility
         if free_light is not None:
             self._shading = ExplainRow(f"shading{suffix}", item_text, inputs=(visibility, free_light))
-            stages = self._shading, *stages
-        super().__init__("", None, free_light, *others, extra_inputs=(visibility,), stages=stages)
+            rows = self._shading, *rows
+        super().__init__("", None, free_light, *others, extra_inputs=(visibility,), rows=rows)
 
     def compute(self, call: Call) -> Any:
         """Light all portions."""
@@ -151,20 +151,20 @@ class Radiosity(Node):
         count: Bounces,
         proxies: Proxies,
         self_form_factors: SelfFormFactors,
-        gathering: Gathering,
+        gatherer: BounceGatherer,
         lit: Node,
         albedo: Node,
         patch_samples: PatchSampleNodes,
     ):
         _, _, frames, placed_proxies, weights = patch_samples
         self._count, self._proxies, senders = count, proxies, proxies.senders
-        self._self_form_factors, self._gathering = self_form_factors, gathering
+        self._self_form_factors, self._gatherer = self_form_factors, gatherer
         item_text = f"{len(senders.areas):,} patches"
         idle = ALL_FLAT if all(senders.merged_scene.is_flat[body] for body in senders.bodies) else ""
         self._reflection = ExplainRow("radiosity", item_text)
         self._self_reflection = ExplainRow("self light of patches", item_text, idle)
-        stages = self._reflection, self._self_reflection, *gathering.stages
-        super().__init__("", None, lit, albedo, placed_proxies, frames, weights, stages=stages)
+        rows = self._reflection, self._self_reflection, *gatherer.rows
+        super().__init__("", None, lit, albedo, placed_proxies, frames, weights, rows=rows)
 
     def compute(self, call: Call) -> OutgoingRadiance:
         """Reflect direct light, then light that has bounced once, and so on; more often between patches of one body."""
@@ -185,7 +185,7 @@ class Radiosity(Node):
                 portions = [portion.direct for portion in lit]
             else:
                 outgoing = outgoing_of(radiosity)
-                portions = [self._gathering.add_bounced(self, call, portion, outgoing) for portion in lit]
+                portions = [self._gatherer.add_bounced(self, call, portion, outgoing) for portion in lit]
             with self.timed(call, self._reflection):
                 return patch_radiosity(albedo, join_portions(portions), senders.mean, weights.shares)
 
@@ -207,7 +207,7 @@ class BouncedShading(DirectLightNode):
     Args:
         visibility, free_light, item_text: As above; one portion after another where nothing is cached.
         radiosity: Radiosity of the patches.
-        gathering: Gathers it at receivers.
+        gatherer: Gathers it at receivers.
     """
 
     def __init__(
@@ -216,17 +216,17 @@ class BouncedShading(DirectLightNode):
         free_light: Node | None,
         item_text: Callable[[], str],
         radiosity: Radiosity,
-        gathering: Gathering,
+        gatherer: BounceGatherer,
     ):
-        self._gathering = gathering
-        super().__init__(visibility, free_light, item_text, others=(radiosity,), stages=gathering.stages)
+        self._gatherer = gatherer
+        super().__init__(visibility, free_light, item_text, others=(radiosity,), rows=gatherer.rows)
 
     def compute(self, call: Call) -> wp.array:
         """Light all portions, directly and by the patches' radiosity."""
         free_light, outgoing = self.values(call)
         portions = self._visibility.value(call) if self._visibility.caches else self._visibility.portions(call)
         lit = (self._light(call, portion, free_light) for portion in portions)
-        return join_portions([self._gathering.add_bounced(self, call, portion, outgoing) for portion in lit])
+        return join_portions([self._gatherer.add_bounced(self, call, portion, outgoing) for portion in lit])
 
 
 class MovingBounces:
@@ -274,7 +274,7 @@ class MovingBounces:
         )
         radiosity = self._radiosity(of_patch_samples, free_light, proxies, materials)
         item_text = functools.partial(receiver_text, points.weak)
-        return BouncedShading(visibility, free_light, item_text, radiosity, self._gathering(senders, item_text))
+        return BouncedShading(visibility, free_light, item_text, radiosity, self._gatherer(senders, item_text))
 
     def _patch_samples(
         self,
@@ -308,8 +308,8 @@ class MovingBounces:
         if materials.emission:
             lit = Node("", _add_emitted, lit, self._method.light_of_emitters(patch_samples.points, materials))
         albedo = self._patches.albedo(materials, senders.bodies)
-        gathering = self._gathering(senders, *arguments, why_not, only_others=True)
-        return Radiosity(self._count, proxies, self._self_form_factors, gathering, lit, albedo, patch_samples)
+        gatherer = self._gatherer(senders, *arguments, why_not, only_others=True)
+        return Radiosity(self._count, proxies, self._self_form_factors, gatherer, lit, albedo, patch_samples)
 
-    def _gathering(self, senders: Senders, *arguments: Any, **options: Any) -> Gathering:
-        return Gathering(self._method.visibility, senders, self._self_form_factors, *arguments, **options)
+    def _gatherer(self, senders: Senders, *arguments: Any, **options: Any) -> BounceGatherer:
+        return BounceGatherer(self._method.visibility, senders, self._self_form_factors, *arguments, **options)

@@ -141,5 +141,5 @@ def path_traced(
 
 def _whole_mesh(merged_scene: MergedScene, casting: wp.Mesh | None, positions: wp.array) -> wp.Mesh:
     """The mesh of all bodies: the mesh of shadow casters if that is all of them."""
-    is_whole = casting is not None and len(merged_scene.casting) == len(merged_scene.scene.bodies)
+    is_whole = casting is not None and len(merged_scene.shadow_casters) == len(merged_scene.scene.bodies)
     return casting if is_whole else merged_scene.mesh(positions)

@@ -55,7 +55,7 @@ class RayTraced(Method):
             light,
             self.shell_of(light),
             items=functools.partial(receiver_text, points.weak),
-            stages=(ExplainRow("transfer", idle="rays shade known light at once"),),
+            rows=(ExplainRow("transfer", idle="rays shade known light at once"),),
         )
 
     def along_paths(self, direct: Node, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
@@ -97,7 +97,7 @@ class RayTraced(Method):
 
         lit, samples = (_checked_points(receivers.points), receivers.normals), self.emitters.samples
         rays = max(1, (self.visibility.ray_count if self.shares_directions else self._sample_count) // (4 * SAMPLES))
-        meshes = [self.merged_scene.casting_mesh(positions[instance]) for instance in range(len(positions))]
+        meshes = [self.merged_scene.blocker_mesh(positions[instance]) for instance in range(len(positions))]
         pairs = zip(samples.spans(), self.emitters.ray_counts(placed_samples, rays), strict=True)
         return [
             trace_transmittances(
@@ -130,12 +130,12 @@ class RayTraced(Method):
         """Node of the trees of all vertices around points."""
         name, vertices = "visibility" if self.shares_directions else "", points.vertices
         items = f"{len(self.merged_scene.body_of_face):,} faces"
-        return points.cached_of_bodies("trees", None, lambda: Node(name, self._trees, vertices, items=items))
+        return points.cached_with_neighbors("trees", None, lambda: Node(name, self._trees, vertices, items=items))
 
     def _trees(self, positions: wp.array) -> list[FaceTree]:
         """Hierarchies of the blockers, for packets of rays."""
         merged_scene = self.merged_scene
-        faces = merged_scene.faces.numpy()[np.isin(merged_scene.body_of_face, merged_scene.casting)]
+        faces = merged_scene.faces.numpy()[np.isin(merged_scene.body_of_face, merged_scene.shadow_casters)]
         return [build_face_tree(item, faces, merged_scene.device) for item in positions.numpy()]
 
     def _meshes(self, points: ShadingContext) -> Node:
@@ -145,13 +145,13 @@ class RayTraced(Method):
             weak_points = points.weak
             return Node(
                 f"visibility{points.suffix}",
-                self._casting_meshes,
+                self._blocker_meshes,
                 points.vertices,
                 detached(points.receivers_node),
                 items=lambda: f"{receiver_text(weak_points)} by rays",
-                idle="" if self.merged_scene.casting else "no body has blockers",
+                idle="" if self.merged_scene.shadow_casters else "no body has blockers",
                 caches=False,
-                stages=(ExplainRow("static shadows", idle="rays treat all receivers alike"),),
+                rows=(ExplainRow("static shadows", idle="rays treat all receivers alike"),),
             )
 
         return points.cached("meshes", None, meshes)
@@ -161,9 +161,9 @@ class RayTraced(Method):
         """Rays of direct light for each receiver."""
         return max(1, self.visibility.ray_count // self.merged_scene.scene.supersampling**2)
 
-    def _casting_meshes(self, positions: wp.array, receivers: Receivers) -> Meshes:
+    def _blocker_meshes(self, positions: wp.array, receivers: Receivers) -> Meshes:
         count = min(len(receivers.points) if receivers.points.size else 0, len(positions))
-        return [self.merged_scene.casting_mesh(positions[instance]) for instance in range(count)]
+        return [self.merged_scene.blocker_mesh(positions[instance]) for instance in range(count)]
 
     def _shade(
         self, meshes: Meshes, receivers: Receivers, light: KnownLight, shell: wp.array | None = None
@@ -172,8 +172,10 @@ class RayTraced(Method):
         samples = sample_map(light.radiance, self._sample_count)
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
         batches = traced, meshes, points, receivers.normals, shells
-        for result, mesh, origins, normals, own_shell in _instances(*batches):
-            wp.copy(result, trace_shading(mesh, origins, normals, samples, shell=own_shell, progress=self.progress))
+        for result, mesh, origins, normals, instance_shell in _instances(*batches):
+            wp.copy(
+                result, trace_shading(mesh, origins, normals, samples, shell=instance_shell, progress=self.progress)
+            )
         return traced
 
     def _shade_shared(
@@ -184,11 +186,13 @@ class RayTraced(Method):
         count = -(-self.visibility.ray_count // PACKET) * PACKET
         traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
         batches = traced, trees, points, receivers.normals, shells
-        for instance, (result, tree, origins, normals, own_shell) in enumerate(_instances(*batches)):
-            arguments, options = (tree, origins, normals), {"shell": own_shell}
+        for instance, (result, tree, origins, normals, instance_shell) in enumerate(_instances(*batches)):
+            arguments, options = (tree, origins, normals), {"shell": instance_shell}
             # a ratio image has the same directions with the bodies and without
-            pilots = None if self.merged_scene.scene.catchers else functools.partial(find_shares, *arguments, **options)
-            samples = cut_map(light.radiance, count, pilots)
+            share_finder = (
+                None if self.merged_scene.scene.catchers else functools.partial(find_shares, *arguments, **options)
+            )
+            samples = cut_map(light.radiance, count, share_finder)
             corners = None
             if receivers.fragments.face_ids.ndim == 3:  # of an image
                 corners = find_corners(receivers, instance, self.merged_scene.scene.supersampling)
@@ -202,8 +206,8 @@ class RayTraced(Method):
         if isinstance(self.basis, CellBasis):
             functions, count = self.basis.balanced_functions, max(count, _RAYS_OF_CELL * self.basis.size)
         batches = transfer, meshes, points, receivers.normals, shells
-        for result, mesh, origins, normals, own_shell in _instances(*batches):
-            options = {"shell": own_shell, "progress": self.progress}
+        for result, mesh, origins, normals, instance_shell in _instances(*batches):
+            options = {"shell": instance_shell, "progress": self.progress}
             wp.copy(result, trace_transfer(mesh, origins, normals, functions, count, **options))
         return [transfer]
 

@@ -35,26 +35,26 @@ def find_bodies_with_buried_vertices(
     visible_faces = np.unique(np.concatenate([*face_ids, np.empty(0, int)])).astype(int)
     margin = _ROUNDING * np.abs(positions).max(initial=0.0)
     starts = merged_scene.first_vertex
-    of_bodies = [positions[starts[number] : starts[number + 1]] for number in merged_scene.casting]
+    of_bodies = [positions[starts[number] : starts[number + 1]] for number in merged_scene.shadow_casters]
     bounds = [(vertices.min(axis=0) - margin, vertices.max(axis=0) + margin) for vertices in of_bodies]
-    is_plane = merged_scene.is_flat[merged_scene.casting]
+    is_plane = merged_scene.is_flat[merged_scene.shadow_casters]
     planes = [vertices for vertices, is_flat in zip(of_bodies, is_plane, strict=True) if is_flat]
     mesh = normals = None
     for number, body in enumerate(bodies):
         corners = faces[visible_faces[merged_scene.body_of_face[visible_faces] == body]]
-        if any(_cross(positions[corners], points, margin) for points in planes):
+        if any(_crosses(positions[corners], points, margin) for points in planes):
             result[number] = True
             continue
         vertices = np.unique(corners)
         points, is_within = positions[vertices], np.zeros(len(vertices), bool)
-        for casting, (low, high) in zip(merged_scene.casting, bounds, strict=True):
-            if casting != body:
+        for caster, (low, high) in zip(merged_scene.shadow_casters, bounds, strict=True):
+            if caster != body:
                 is_within |= ((points >= low) & (points <= high)).all(axis=1)
         candidates = vertices[is_within]
         if len(candidates):
             if mesh is None or normals is None:
                 on_device = wp.array(positions, dtype=wp.vec3, device=merged_scene.device)
-                mesh = merged_scene.casting_mesh(on_device)
+                mesh = merged_scene.blocker_mesh(on_device)
                 normals = vertex_normals(on_device.reshape((1, -1)), merged_scene.one_rings).numpy()[0]
             is_buried = np.zeros(len(positions), bool)
             is_buried[candidates] = find_buried(mesh, positions[candidates], normals[candidates])
@@ -62,7 +62,7 @@ def find_bodies_with_buried_vertices(
     return result
 
 
-def _cross(corners: np.ndarray, plane_points: np.ndarray, margin: float) -> bool:
+def _crosses(corners: np.ndarray, plane_points: np.ndarray, margin: float) -> bool:
     """Whether a face [face, 3, 3] goes through the rectangle around points of a plane."""
     axes, middle = principal_axes(plane_points.astype(np.float64)), plane_points.mean(axis=0)
     local, (half_width, half_height, _) = (corners - middle) @ axes.T, np.abs((plane_points - middle) @ axes.T).max(0)

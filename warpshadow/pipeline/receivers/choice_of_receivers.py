@@ -22,7 +22,7 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.receivers.buried_vertices import find_bodies_with_buried_vertices
-from warpshadow.pipeline.receivers.unevenness import NearLight, light_unevenness
+from warpshadow.pipeline.receivers.unevenness import EmitterLuminance, light_unevenness
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene, change_bodies
 from warpshadow.scene.visibility import AUTO, Visibility
@@ -90,7 +90,7 @@ def choose_receivers(
     cameras: Sequence[Camera],
     *,
     is_light_free: bool = False,
-    near_light: NearLight | None = None,
+    emitter_luminance: EmitterLuminance | None = None,
 ) -> list[ReceiverChoice]:
     """Choose the receivers of the bodies that leave it open, as cameras see the scene.
 
@@ -101,7 +101,7 @@ def choose_receivers(
         merged_scene: The bodies.
         cameras: The cameras that see them.
         is_light_free: Whether light is given as coefficients, so that nobody knows where shadows will have edges.
-        near_light: Of emitters; None without any.
+        emitter_luminance: Of emitters; None without any.
     """
     traits = merged_scene.scene.visibility.traits
     if traits.every_sample_receives:
@@ -120,8 +120,8 @@ def choose_receivers(
     chosen = np.where([size.exceeds(limit) for size, limit in zip(sizes, limits, strict=True)], "pixel", "vertex")
     is_seen_large = np.array([size.area > SMALL_FACE for size in sizes])
     # where the shadows of emitters and of light from a shell have edges, probes do not tell
-    is_near = merged_scene.is_emitter.any() or merged_scene.scene.shell is not None
-    choice_at_edges = "pixel" if is_near else "adaptive"
+    has_unprobed_light = merged_scene.is_emitter.any() or merged_scene.scene.shell is not None
+    choice_at_edges = "pixel" if has_unprobed_light else "adaptive"
     chosen = np.where(merged_scene.is_flat & is_sharp & is_seen_large, choice_at_edges, chosen)
     is_undecided = (chosen == "vertex") & (np.array(requested) == AUTO) & (~merged_scene.is_flat | is_sharp)
     unevenness, shows_buried = np.zeros(len(chosen)), np.zeros(len(chosen), bool)
@@ -131,7 +131,9 @@ def choose_receivers(
         shown_faces = [(camera, *counted) for camera, counted in zip(cameras, faces, strict=True)]
         light = EnvironmentMap.constant() if is_light_free else merged_scene.scene.known_light
         bodies = np.flatnonzero(is_undecided).tolist()
-        unevenness[is_undecided] = light_unevenness(merged_scene, positions, shown_faces, bodies, light, near_light)
+        unevenness[is_undecided] = light_unevenness(
+            merged_scene, positions, shown_faces, bodies, light, emitter_luminance
+        )
         even_bodies = np.flatnonzero(is_undecided & (unevenness <= max_unevenness)).tolist()
         face_ids = [ids for ids, _ in faces]
         shows_buried[even_bodies] = find_bodies_with_buried_vertices(merged_scene, positions, face_ids, even_bodies)
@@ -153,7 +155,7 @@ def with_receivers(scene: Scene, choices: Sequence[ReceiverChoice]) -> Scene:
     return change_bodies(scene, "receivers", changed)
 
 
-def for_picture(scene: Scene) -> Scene:
+def for_still(scene: Scene) -> Scene:
     """The scene, for a still: by rays, where it names neither a method nor settings that rays leave unused.
 
     All receivers share their directions, as many as ``samples`` says, 512 by default. They need no spheres and no
@@ -204,9 +206,9 @@ def receiver_notes(scene: Scene, choices: Sequence[ReceiverChoice], bulging_bodi
     notes = []
     for number, (body, choice) in enumerate(zip(scene.bodies, choices, strict=True)):
         if body.receivers == AUTO and choice.size is not None:
-            where, why = _WHERE[choice.receivers], _reason(choice)
+            where, why = _RECEIVER_WORDS[choice.receivers], _reason(choice)
             if number in bulging_bodies:
-                where, why = _WHERE["vertex"], "spheres block its light, and bulge out of it between vertices"
+                where, why = _RECEIVER_WORDS["vertex"], "spheres block its light, and bulge out of it between vertices"
             notes.append(f"Body {number} ({body.name!r}) has receivers at {where}: {why}.")
     return notes
 
@@ -230,7 +232,7 @@ def warn_of_coarse_faces(bodies: Sequence[Body], sizes: Sequence[FaceSize]) -> N
             )
 
 
-_WHERE = {
+_RECEIVER_WORDS = {
     "vertex": "vertices",
     "pixel": "pixels",
     "adaptive": "pixels, close to each other where shadows have edges, since it is flat",

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, cut, expand
-from warpshadow.device.constants import Identity, constant
+from warpshadow.device.constants import IdentityKey, constant
 from warpshadow.device.launch import varies
 from warpshadow.pipeline.bodies.convex import GroupConvexParts, SceneConvexParts
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
@@ -42,11 +42,11 @@ class BodySides:
     def __init__(self, planes: ScenePlanes, positions: wp.array):
         self._planes, self.positions = planes, positions
         self._is_captured = positions.device.is_capturing
-        self._sides: dict[Identity, wp.array] = {}
+        self._sides: dict[IdentityKey, wp.array] = {}
 
     def sides_of(self, frames: wp.array, planes: PlaneBlockers) -> wp.array:
         """The side of each plane on which each body lies, [batch, body, plane], found once for all receivers."""
-        if (key := Identity(frames)) in self._sides:
+        if (key := IdentityKey(frames)) in self._sides:
             return self._sides[key]
         corners, first_corner = self._planes.corners(self.positions), self._planes.first_corner
         sides = find_body_sides(corners, first_corner, frames, planes)

@@ -110,9 +110,9 @@ class ShadingContext:
         self.call, self.static_bodies = call, static_bodies
         self.normals = Node("", vertex_normals, vertices, merged_scene.one_rings) if normals is None else normals
         self._cached: dict[str, tuple[Hashable, Any]] = {}
-        self._cached_of_bodies: dict[str, tuple[Hashable, Any]] = {}
+        self._cached_with_neighbors: dict[str, tuple[Hashable, Any]] = {}
         if neighbors is not None:
-            self._cached_of_bodies = neighbors._cached_of_bodies
+            self._cached_with_neighbors = neighbors._cached_with_neighbors
 
     def cached(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
         """A value for the points, such as a node, cached under a name while its inputs stay the same."""
@@ -122,9 +122,9 @@ class ShadingContext:
         """The value cached under a name, whatever it was made from; None without one."""
         return self._cached.get(name, (None, None))[1]
 
-    def cached_of_bodies(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
+    def cached_with_neighbors(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
         """A cached value that all points among the same bodies share."""
-        return _cached(self._cached_of_bodies, name, key, make)
+        return _cached(self._cached_with_neighbors, name, key, make)
 
     def with_receivers(self: Context, receivers: Node) -> Context:
         """Copy with other receivers, without cached values; any of the blockers may move."""
@@ -136,7 +136,7 @@ class ShadingContext:
     def preview(self: Context) -> Context:
         """The points with the values cached so far, which does not add its own to them."""
         points = copy.copy(self)
-        points._cached_of_bodies = dict(self._cached_of_bodies)
+        points._cached_with_neighbors = dict(self._cached_with_neighbors)
         points._cached = {
             name: (key, value.preview() if isinstance(value, ShadingContext) else value)
             for name, (key, value) in self._cached.items()

@@ -14,7 +14,7 @@ from collections.abc import Callable, Hashable
 import numpy as np
 import warp as wp
 
-from warpshadow.device.constants import use
+from warpshadow.device.constants import note_use
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.memory import empty, from_numpy
 from warpshadow.maths.inset import inset_vertices
@@ -55,7 +55,7 @@ class StaticBodies:
                 f"geometry: got instances that differ in more than the bodies {self.moving}, expected their moving to "
                 "name all that do"
             )
-        self._vertex_runs = merged_scene.runs(merged_scene.first_vertex, self.moving)
+        self._vertex_ranges = merged_scene.ranges_of(merged_scene.first_vertex, self.moving)
         self.normals = Node("", vertex_normals, self._geometry.positions, merged_scene.one_rings)
         self._clip_positions: Node | None = None
         self._gathered: tuple = (None,)  # vertices, and points and normals of them
@@ -73,25 +73,25 @@ class StaticBodies:
             for array, static, start in zip(
                 geometry.arrays().values(), self._geometry.arrays().values(), starts, strict=True
             )
-            for first, end in self._merged_scene.runs(start, self.bodies)
+            for first, end in self._merged_scene.ranges_of(start, self.bodies)
         )
 
     # ------------------------------------------------------------------------------------------ vertices
 
     def clip_positions(self, cameras: Input) -> Node:
         """Clip positions of all vertices, vec4 of shape [camera, vertex]; moving vertices' are undefined."""
-        if self._clip_positions is None or self._clip_positions.before != [cameras]:
+        if self._clip_positions is None or self._clip_positions.dependencies != [cameras]:
             self._clip_positions = Node("", to_clip, self._geometry.positions, cameras)
         return self._clip_positions
 
     def with_moving_clip_positions(self, positions: wp.array, clip_matrices: wp.array, cached: wp.array) -> wp.array:
         """Overwrite the clip positions of moving vertices. Differentiable: positions."""
-        return splice(cached, self._vertex_runs, lambda a, b: to_clip(positions[:, a:b], clip_matrices))
+        return splice(cached, self._vertex_ranges, lambda a, b: to_clip(positions[:, a:b], clip_matrices))
 
     def with_moving_normals(self, positions: wp.array, cached: wp.array) -> wp.array:
         """Overwrite the normals of moving vertices. Differentiable: positions."""
         rings_of = self._merged_scene.rings_of
-        return splice(cached, self._vertex_runs, lambda a, b: vertex_normals(positions[:, a:b], rings_of(a, b)))
+        return splice(cached, self._vertex_ranges, lambda a, b: vertex_normals(positions[:, a:b], rings_of(a, b)))
 
     def receivers(self, vertices: np.ndarray, normals: wp.array) -> tuple[wp.array, wp.array]:
         """Gather points and normals of some vertices: vec3 of shape [1, receiver].
@@ -102,7 +102,7 @@ class StaticBodies:
         """
         if not np.array_equal(vertices, self._gathered[0]):
             self._gathered = vertices, *self.gathered(vertices, normals)
-        use(*self._gathered[1:])
+        note_use(*self._gathered[1:])
         return self._gathered[1:]
 
     def gathered(self, vertices: np.ndarray, normals: wp.array) -> tuple[wp.array, wp.array]:
@@ -138,7 +138,7 @@ class StaticBodies:
     @functools.cached_property
     def mesh(self) -> wp.Mesh | None:
         """The mesh of the static bodies that rays meet."""
-        return self._merged_scene.casting_mesh(self._geometry.positions[0], self.bodies)
+        return self._merged_scene.blocker_mesh(self._geometry.positions[0], self.bodies)
 
     def rows(self, key: Hashable, find: Callable[["StaticBodies", np.ndarray, wp.array], wp.array]) -> "VertexRows":
         """Rows of numbers, such as log sums, of static vertices.
@@ -198,7 +198,7 @@ class VertexRows:
         if self._index is None or not np.array_equal(vertices, self._vertices):
             self._vertices = vertices
             self._index = from_numpy(self._row_of_vertex[vertices], dtype=wp.int32, device=self._rows.device)
-        use(self._rows, self._index)
+        note_use(self._rows, self._index)
         return CachedRows(self._rows, self._index)
 
     def _append(self, rows: wp.array) -> None:

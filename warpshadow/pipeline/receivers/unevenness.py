@@ -26,7 +26,7 @@ _FACES = 256  # of a body that are looked at, at most
 _DARK = 1e-3  # of the brightest middle of a face, up to which a body's light is no matter
 
 
-NearLight: TypeAlias = Callable[[wp.array, wp.Mesh | None, np.ndarray, np.ndarray], np.ndarray]
+EmitterLuminance: TypeAlias = Callable[[wp.array, wp.Mesh | None, np.ndarray, np.ndarray], np.ndarray]
 """Gives the luminance of light of emitters, given the vertices of all bodies, vec3 of shape [vertex], the mesh of all
 that block, None for none, and points with unit normals, [point, 3]."""
 
@@ -37,7 +37,7 @@ def light_unevenness(
     images: Sequence[tuple[Camera, np.ndarray, np.ndarray]],
     bodies: Sequence[int],
     light: KnownLight,
-    near_light: NearLight | None = None,
+    emitter_luminance: EmitterLuminance | None = None,
 ) -> np.ndarray:
     """Error of direct light on bodies that is interpolated between their vertices, over their pixels, relative L2.
 
@@ -48,7 +48,7 @@ def light_unevenness(
             each time.
         bodies: Bodies to look at.
         light: Their light from afar.
-        near_light: That of emitters; None without any.
+        emitter_luminance: That of emitters; None without any.
     Returns:
         Of each of these bodies, shape [body]; 0 where no image shows it.
     """
@@ -58,10 +58,10 @@ def light_unevenness(
     of_body = [np.flatnonzero(merged_scene.body_of_face[seen] == body) for body in bodies]
     chosen = [rows[:: -(-len(rows) // _FACES)] if len(rows) else rows for rows in of_body]
     rows = np.concatenate(chosen)
-    if not len(rows) or not (merged_scene.casting or near_light):
+    if not len(rows) or not (merged_scene.shadow_casters or emitter_luminance):
         return result
     vertices = wp.array(positions, dtype=wp.vec3, device=device)
-    mesh = merged_scene.casting_mesh(vertices)
+    mesh = merged_scene.blocker_mesh(vertices)
     normals = vertex_normals(vertices.reshape((1, -1)), merged_scene.one_rings).numpy()[0]
     faces = merged_scene.faces.numpy()
     origins, corners = inset_vertices(positions, faces), faces[seen[rows]]
@@ -71,9 +71,9 @@ def light_unevenness(
     lengths = np.linalg.norm(point_normals, axis=2, keepdims=True)
     point_normals *= np.where(is_behind, -1, 1)[:, None, None] / lengths.clip(1e-30)
     received = _irradiance(mesh, points, point_normals, light, device)
-    if near_light is not None:
+    if emitter_luminance is not None:
         receivers = points.reshape(-1, 3), point_normals.reshape(-1, 3)
-        received += near_light(vertices, mesh, *receivers).reshape(received.shape)
+        received += emitter_luminance(vertices, mesh, *receivers).reshape(received.shape)
     at_middles, errors = received[:, 3], received[:, :3].mean(axis=1) - received[:, 3]
     threshold, first = _DARK * at_middles.max(initial=0.0), 0
     for number, part in enumerate(chosen):

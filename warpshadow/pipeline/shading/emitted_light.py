@@ -126,7 +126,7 @@ def _find_transmittances(
         """The receivers' own body in each geometry, for all emitters within it."""
         bodies = () if group.body is None else (group.body,)
         positions = blockers.positions
-        return [merged_scene.casting_mesh(positions[geometry], bodies) for geometry in range(len(positions))]
+        return [merged_scene.blocker_mesh(positions[geometry], bodies) for geometry in range(len(positions))]
 
     for body, span, hidden_by_itself in zip(emitters.bodies, emitters.spans(), self_visibility, strict=True):
         is_on_emitter = body == group.body

@@ -130,7 +130,7 @@ class SceneEmitters:
         merged_scene = self._merged_scene
         mesh, is_open = merged_scene.scene.bodies[body].mesh, bool(merged_scene.is_two_sided[body])
         is_convex = len(mesh.convex_parts) == 1 and not is_open
-        if merged_scene.is_flat[body] or is_convex or body not in merged_scene.casting:
+        if merged_scene.is_flat[body] or is_convex or body not in merged_scene.shadow_casters:
             return None
         samples = weights.vertices @ mesh.positions.astype(np.float64), weights.surface_points
         surface, device = (mesh.positions, mesh.surface.faces), merged_scene.device
@@ -140,7 +140,7 @@ class SceneEmitters:
     def direct_luminance(
         self, vertices: wp.array, mesh: wp.Mesh | None, points: np.ndarray, normals: np.ndarray
     ) -> np.ndarray:
-        """Luminance of their light past the scene's meshes, a :data:`.NearLight`."""
+        """Luminance of their light past the scene's meshes, a :data:`.EmitterLuminance`."""
         from warpshadow.stages.emitters.traced_transmittance import trace_transmittance
 
         merged_scene, samples = self._merged_scene, self.samples
@@ -181,7 +181,7 @@ class SceneEmitters:
 
     def samples_node(self, points: ShadingContext) -> Node:
         """Node of the samples among the bodies around points."""
-        return points.cached_of_bodies("emitters", None, lambda: Node("", self._place, points.vertices))
+        return points.cached_with_neighbors("emitters", None, lambda: Node("", self._place, points.vertices))
 
     def _place(self, vertices: wp.array) -> PlacedSamples:
         return place_samples(vertices, self.samples)

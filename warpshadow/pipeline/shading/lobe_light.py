@@ -95,7 +95,7 @@ class LobeVisibility:
         return self._cached(name, points, light, lambda: Node("prefiltering", *arguments))
 
     def _prefilter(self, light: KnownLight, separated: SeparatedLight | None) -> wp.array:
-        radiance = light.radiance if separated is None else separated.rest
+        radiance = light.radiance if separated is None else separated.without_suns
         return constant(prefilter(radiance)[None], wp.vec3, self._merged_scene.device)
 
     def transmittance(self, lobes: LitLobes, directions: Node) -> Node:

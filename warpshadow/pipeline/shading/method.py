@@ -49,7 +49,7 @@ class Method(abc.ABC):
     | :meth:`highlights` | lamps, on bodies that shine | – |
     | :attr:`lobes` | bodies that shine | no shadows in mirrored light |
     | :meth:`openness` | light that bounces between static patches | None: rays find it, as they find form factors |
-    | :meth:`along_paths` | light that bounces along paths (:func:`.choose_bouncing`) | refused |
+    | :meth:`along_paths` | light that bounces along paths (:func:`.choose_bounce_solver`) | refused |
     | :meth:`blocker_kinds` | planes, convex parts, traced self-visibility | spheres alone |
     | :meth:`find_squares` | adaptive receivers | None, where every sample receives light |
     | the three fields below | as they say | False |

@@ -10,7 +10,7 @@ import warp as wp
 
 from warpshadow.assets.known_light import KnownLight
 from warpshadow.assets.light import EnvironmentMap
-from warpshadow.device.constants import Identity
+from warpshadow.device.constants import IdentityKey
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
@@ -131,7 +131,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         if light is self.light:
             return self._projected_scene_light
         make = functools.partial(Node, "", self.project_light, light, self.shell_of(light))
-        return points.cached_of_bodies("projected", light, make)
+        return points.cached_with_neighbors("projected", light, make)
 
     def visibility_basis(self, points: ShadingContext, light: LightInput) -> Node | Projected:
         """The light by which visibility is found, projected: known light, or any free light of the same shell."""
@@ -142,7 +142,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         if shell is None:
             return self.free_basis
         make = functools.partial(Node, "", self.free_basis_of_shell, shell)
-        return points.cached_of_bodies("free basis", shell, make)
+        return points.cached_with_neighbors("free basis", shell, make)
 
     def _with_free_light(self, light: wp.array, free_basis: Projected) -> Projected:
         """Project given free light for the method. Differentiable: light."""
@@ -226,7 +226,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
             find_in_portions,
             points.receivers_node,
             blockers_node(self, points),
-            points.cached_of_bodies("self-visibility towards emitters", None, lookups),
+            points.cached_with_neighbors("self-visibility towards emitters", None, lookups),
             self.emitters.samples_node(points),
             self.emitters.radiance(materials),
             *others,
@@ -326,7 +326,7 @@ class VisibilityNode(Node):
             self_visibility_node(method, points, projected_light),
             _static_shadows_node(method, points, light),
             None if points.static_bodies is None else points.static_bodies.normals,
-            stages=steps[: self.step_count],
+            rows=steps[: self.step_count],
             caches=caches,
         )
 
@@ -429,13 +429,13 @@ def _why_unblocked(method: SphereMethod, points: ShadingContext) -> str:
 def blockers_node(method: SphereMethod, points: ShadingContext) -> Node:
     """Node of the blockers around points, where they are in the world."""
     place = functools.partial(method.scene_blockers.place_blockers, points.blocker_kinds)
-    return points.cached_of_bodies("blockers", None, lambda: Node("", place, points.vertices, points.spheres))
+    return points.cached_with_neighbors("blockers", None, lambda: Node("", place, points.vertices, points.spheres))
 
 
 def self_visibility_node(method: SphereMethod, points: ShadingContext, projected_light: Node | ProjectedLight) -> Node:
     """Node of the receivers' self-visibility lookups, by body; the same for any receivers among the same bodies."""
     make = functools.partial(_self_visibility, method, points.blocker_kinds, projected_light)
-    return points.cached_of_bodies("self-visibility", Identity(projected_light), make)
+    return points.cached_with_neighbors("self-visibility", IdentityKey(projected_light), make)
 
 
 def _self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds, projected_light: Node | ProjectedLight) -> Node:
@@ -456,8 +456,8 @@ def _static_shadows_node(method: SphereMethod, points: ShadingContext, light: In
     """Node of cached transmittance past static bodies; its value is None if there are none."""
     static_bodies, weak_points = points.static_bodies, points.weak
     if static_bodies is None or not static_bodies.spheres[1].shape[1]:
-        bouncing = bool(method.merged_scene.scene.bounces)
-        why = "light bounces: nothing of static bodies is cached" if bouncing else "no static body has blockers"
+        light_bounces = bool(method.merged_scene.scene.bounces)
+        why = "light bounces: nothing of static bodies is cached" if light_bounces else "no static body has blockers"
         return Node("static shadows", None, idle=why)
     rows = method.cached_rows(static_bodies, light, points.blocker_kinds)
 

@@ -17,7 +17,7 @@ from warpshadow.pipeline.views.scene_views import SceneViews
 from warpshadow.pipeline.views.view import View
 
 
-class CatchersAlone:
+class CatcherScene:
     """The catchers of a scene as a scene of their own, with the same receivers and spheres.
 
     Args:
@@ -28,7 +28,7 @@ class CatchersAlone:
     def __init__(self, views: SceneViews, merged_scene: MergedScene):
         self._views, self._merged_scene, self._numbers = views, merged_scene, merged_scene.scene.catchers
 
-    def with_cameras(self, cameras: Sequence[Camera]) -> CatchersAlone:
+    def with_cameras(self, cameras: Sequence[Camera]) -> CatcherScene:
         """Copy for other cameras."""
         alone = copy.copy(self)
         alone._views = self._views.with_cameras(cameras)

@@ -12,7 +12,7 @@ from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
 from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.method import Method
-from warpshadow.stages.image.slopes import find_mean_slopes
+from warpshadow.stages.image.slopes import find_outline_samples
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
 from warpshadow.stages.receivers.receiver_footprints import FootprintInputs
@@ -89,7 +89,7 @@ class ReceiverFinder:
                 )
                 quadtree = method.find_squares(self._blocker_kinds, surfaces)
         if at_samples.any() and fragments.barycentrics.requires_grad:
-            has_mean_slope = find_mean_slopes(silhouettes, clip_positions, quadtree)
+            has_mean_slope = find_outline_samples(silhouettes, clip_positions, quadtree)
         shares_surfaces = (
             self._may_share_surfaces and min(fragments.face_ids.shape[1:]) >= _MIN_SHARED_SIZE * self._supersampling
         )
@@ -105,7 +105,7 @@ class ReceiverFinder:
             bodies=None if separate is None else gather_of_owners(separate, body_of_face),
             supersampling=1 if method.shares_directions and not shares_surfaces else self._supersampling,
             quadtree=quadtree,
-            rises=scene_receivers.at_all_samples,
+            lifts_to_smooth_surface=scene_receivers.at_all_samples,
             smooth_pieces=merged_scene.smooth_pieces if shares_surfaces else None,
             has_mean_slope=has_mean_slope,
             shares_receivers=None if method.shares_lobes else gather_of_owners(~merged_scene.is_glossy, body_of_face),

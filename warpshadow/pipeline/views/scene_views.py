@@ -15,7 +15,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
-from warpshadow.device.constants import use
+from warpshadow.device.constants import note_use
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.pipeline.bodies.geometry import PLACED, Geometry, as_geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
@@ -126,7 +126,7 @@ class SceneViews:
             static_bodies = self._static.get(geometry.moving)
             if static_bodies is None or not static_bodies.matches(geometry):
                 static_bodies = StaticBodies(self._merged_scene, geometry)
-            use(static_bodies)
+            note_use(static_bodies)
         arguments = vertices, spheres, cameras, static_bodies, self._blocker_kinds(geometry, last)
         for view in self.last:
             if view is not None and view.dependencies == arguments:

@@ -17,7 +17,7 @@ from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.receiver_finder import ReceiverFinder
 from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.image.film import average, sample_radiance, sum_radiance
-from warpshadow.stages.image.slopes import find_mean_slopes, hold_fragments, moving_radiance
+from warpshadow.stages.image.slopes import detach_near_outlines, find_outline_samples, moving_radiance
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.rasterization import Fragments, rasterize
@@ -77,11 +77,21 @@ class View(ShadingContext):
         self._size = self._supersampling * camera.width, self._supersampling * camera.height
         self._sample_count = counts[1] * self._size[0] * self._size[1]
         self._sample_text = f"{self._sample_count:,} samples"
-        normals, receivers = self._wire(method, *self.dependencies)
-        lit = method.merged_scene, materials, vertices, spheres, receivers, call
-        super().__init__(*lit, static_bodies, normals, blocker_kinds, is_scene_view)
+        normals, receivers = self._make_nodes(method, *self.dependencies)
+        super().__init__(
+            method.merged_scene,
+            materials,
+            vertices,
+            spheres,
+            receivers,
+            call,
+            static_bodies,
+            normals,
+            blocker_kinds,
+            is_scene_view,
+        )
 
-    def _wire(
+    def _make_nodes(
         self,
         method: Method,
         vertices: Input,
@@ -107,7 +117,7 @@ class View(ShadingContext):
             sides = Node("sides", find_sides, *side_inputs, items=samples, has_adjoint=False)
         else:
             sides = Node("sides", identity, fragments, idle="every body is closed: none is seen from behind")
-        edge_inputs = merged_scene.edges, clip, merged_scene.face_bodies, merged_scene.creases
+        edge_inputs = merged_scene.face_neighbors, clip, merged_scene.face_bodies, merged_scene.creases
         silhouettes = Node(
             "silhouettes", find_silhouettes, sides, faces, *edge_inputs, items=samples, has_adjoint=False
         )
@@ -141,12 +151,10 @@ class View(ShadingContext):
         shading, reflectance = self.shading(light, materials), self._moving_reflectance(materials)
         shines = materials.roughness or materials.emission
         if not shines and reflectance.pyramids.requires_grad and not (shading.requires_grad or clip.requires_grad):
-            replaced_stages = (ExplainRow("reflectance", idle="found with the radiance"),)
+            replaced_rows = (ExplainRow("reflectance", idle="found with the radiance"),)
             reflectance_inputs = reflectance.vertex_albedo, reflectance.pyramids, reflectance.footprints
             arguments = fragments, self.merged_scene.faces, *reflectance_inputs, self._white_radiance_of(shading)
-            samples = Node(
-                "radiance", textured_radiance, *arguments, items=item_text, caches=False, stages=replaced_stages
-            )
+            samples = Node("radiance", textured_radiance, *arguments, items=item_text, caches=False, rows=replaced_rows)
         else:
             samples = self._reflected_and_emitted(shading, light, materials, reflectance.samples)
         return self._averaged(samples, is_moving=self._is_moving)
@@ -157,13 +165,13 @@ class View(ShadingContext):
 
     def _moving_reflectance(self, materials: Materials) -> SampleReflectance:
         """Nodes of the reflectance that :meth:`_radiance` takes, whose patterns move by mean slopes near outlines."""
-        return self._reflectance_of(materials, self._patterned(materials)[0])
+        return self._reflectance_of(materials, self._fragments_of_patterns(materials)[0])
 
     def _reflectance_of(self, materials: Materials, fragments: Node) -> SampleReflectance:
-        wire = functools.partial(self._find_reflectance, materials, fragments)
-        return self.cached("reflectance", fragments, wire) if materials is self.materials else wire()
+        make_nodes = functools.partial(self._find_reflectance, materials, fragments)
+        return self.cached("reflectance", fragments, make_nodes) if materials is self.materials else make_nodes()
 
-    def _patterned(self, materials: Materials) -> tuple[Node, Node | None]:
+    def _fragments_of_patterns(self, materials: Materials) -> tuple[Node, Node | None]:
         """Nodes of the fragments by which colors move, and of the samples whose colors have mean slopes instead.
 
         None have them, and the latter is None, where nothing moves or each body has one color.
@@ -171,12 +179,12 @@ class View(ShadingContext):
         if not (self._is_moving and materials.have_patterns):
             return self.fragments_node, None
 
-        def wire() -> tuple[Node, Node]:
+        def make_nodes() -> tuple[Node, Node]:
             seen = detached(self.silhouettes), detached(self.clip_positions)
-            slopes = Node("", find_mean_slopes, *seen)
-            return Node("", hold_fragments, self.fragments_node, slopes), slopes
+            is_near_outline = Node("", find_outline_samples, *seen)
+            return Node("", detach_near_outlines, self.fragments_node, is_near_outline), is_near_outline
 
-        return self.cached("mean slopes", None, wire)
+        return self.cached("mean slopes", None, make_nodes)
 
     def _find_reflectance(self, materials: Materials, fragments: Node) -> SampleReflectance:
         textures = materials.textures_of["textures"]
@@ -186,8 +194,8 @@ class View(ShadingContext):
         if materials.textures is not self.materials.textures:
             pyramids = textures.pyramids_to(functools.partial(self.coarsest_level, textures.sizes))
         arguments = fragments, self.clip_positions, pyramids, self._sample_text
-        key, wire = (textures.sizes, fragments), functools.partial(textures.footprints, *arguments)
-        footprints = self.cached("footprints", key, wire)
+        key, make_nodes = (textures.sizes, fragments), functools.partial(textures.footprints, *arguments)
+        footprints = self.cached("footprints", key, make_nodes)
         return materials.reflectance(fragments, pyramids, footprints, self._sample_text)
 
     def coarsest_level(self, sizes: tuple) -> int | None:
@@ -215,7 +223,7 @@ class View(ShadingContext):
             reflected = self._radiance(shading, reflectance, materials)
         if not materials.emission:
             return reflected
-        emission = self._emission(materials, self._patterned(materials)[0])
+        emission = self._emission(materials, self._fragments_of_patterns(materials)[0])
         emitted = self._radiance(Node("", _white_shading, self.receivers_node), emission, materials)
         return self._sum_of(reflected, emitted)
 
@@ -224,13 +232,13 @@ class View(ShadingContext):
         textures = materials.textures_of["emission"]
         seen = fragments, self.merged_scene.faces, materials.of_vertices("emission")
         if not textures.images:
-            return self._within_beams(Node("emission", interpolate, *seen))
+            return self._dimmed_by_beams(Node("emission", interpolate, *seen))
         arguments = fragments, self.clip_positions, textures.pyramids, ""
-        wire = functools.partial(textures.footprints, *arguments)
-        footprints = self.cached("footprints in emission", (textures.sizes, fragments), wire)
-        return self._within_beams(Node("emission", sample_albedo, *seen, textures.pyramids, footprints))
+        make_nodes = functools.partial(textures.footprints, *arguments)
+        footprints = self.cached("footprints in emission", (textures.sizes, fragments), make_nodes)
+        return self._dimmed_by_beams(Node("emission", sample_albedo, *seen, textures.pyramids, footprints))
 
-    def _within_beams(self, emission: Node) -> Node:
+    def _dimmed_by_beams(self, emission: Node) -> Node:
         """Node of the part of emission that goes towards the cameras; itself where no emitter has a beam."""
         if not self.merged_scene.has_beams:
             return emission
@@ -319,8 +327,8 @@ class View(ShadingContext):
         """Node of the samples; given materials, the reflectance is that of surfaces, with which it moves."""
         make_node = functools.partial(Node, "radiance", items=self._sample_text, caches=False)
         if self._is_moving:
-            slopes = None if materials is None else self._patterned(materials)[1]
-            moving = self.silhouettes, self.clip_positions, slopes
+            is_near_outline = None if materials is None else self._fragments_of_patterns(materials)[1]
+            moving = self.silhouettes, self.clip_positions, is_near_outline
             return make_node(_moving_radiance, self.receivers_node, shading, reflectance, *moving)
         return make_node(_radiance, self.receivers_node, shading, reflectance)
 

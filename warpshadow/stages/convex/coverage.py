@@ -103,7 +103,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         parts, cells, radius = inputs.parts, inputs.cells, inputs.radius
         covered_count = int(0)
         silhouette = task.silhouette
-        enough = wp.where(parts.signs[parts.first_part[piece + 1] - 1] < 0.0, 1.0e30, 1.0)  # seams take off
+        max_sum = wp.where(parts.signs[parts.first_part[piece + 1] - 1] < 0.0, 1.0e30, 1.0)  # seams take off
         for part in range(parts.first_part[piece], parts.first_part[piece + 1]):
             bound = find_bound(inputs, part, task)
             sign = parts.signs[part]
@@ -113,11 +113,11 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
                     if reaches_bundle(bound, cells.axes[bundle], cells.half_angles[bundle]):
                         for q in range(bundle * BUNDLE, (bundle + 1) * BUNDLE):
                             direction = cells.directions[q]
-                            before = task.coverage[q].share
-                            room = wp.min(Lane(enough) - before, Lane(1.0) - task.sums[q].largest)
+                            covered_share = task.coverage[q].share
+                            remaining_share = wp.min(Lane(max_sum) - covered_share, Lane(1.0) - task.sums[q].largest)
                             if sign < 0.0:
-                                room = wp.min(room, before)  # prisms cover the same cells
-                            effect = wp.min(find_reach(task, bound, direction), room)
+                                remaining_share = wp.min(remaining_share, covered_share)  # prisms cover the same cells
+                            effect = wp.min(find_reach(task, bound, direction), remaining_share)
                             if is_any_above(effect, 0.0):
                                 if not is_found:
                                     count, is_solid = find_silhouette(parts, part, silhouette)
@@ -127,12 +127,12 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
                                 by_part = find_coverage(parts, silhouette, direction, radius)
                                 is_affected = is_positive(effect)
                                 if is_any_above(wp.cw_mul(is_affected, by_part.share), 0.0):
-                                    if not is_any_above(before, 0.0):
+                                    if not is_any_above(covered_share, 0.0):
                                         task.covered[covered_count] = q
                                         covered_count += 1
                                     factor = sign * is_affected
                                     task.coverage[q] = Coverages(
-                                        before + wp.cw_mul(factor, by_part.share),
+                                        covered_share + wp.cw_mul(factor, by_part.share),
                                         add(task.coverage[q].moment, scale(factor, by_part.moment)),
                                     )
         return covered_count

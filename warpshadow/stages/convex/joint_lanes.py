@@ -145,10 +145,10 @@ def make_joint_functions(lanes: int) -> JointFunctions:
     def blocker_adjoint(sums: SumsOfBlockers, adj: SumsOfBlockers, coverage: Coverages):
         """Gradient of the coverage by one blocker, given those of the sums; 0 where that covers all or nothing."""
         share = coverage.share
-        rest = Lane(1.0) - share
-        is_partial = wp.cw_mul(is_positive(share), is_positive(rest))
+        open_share = Lane(1.0) - share
+        is_partial = wp.cw_mul(is_positive(share), is_positive(open_share))
         difference = wp.max(sums.largest - share, share - sums.largest)
-        adj_share = adj.total - wp.cw_div(wp.cw_mul(adj.product, sums.product), wp.max(rest, Lane(1.0e-30)))
+        adj_share = adj.total - wp.cw_div(wp.cw_mul(adj.product, sums.product), wp.max(open_share, Lane(1.0e-30)))
         adj_share += wp.cw_mul(Lane(1.0) - is_positive(difference), adj.largest)
         adj_bound = adj.bounds + 2.0 * wp.cw_mul(moment_bound(share), adj.bound_squares)
         adj_share += wp.cw_mul(adj_bound, moment_bound_slope(share))

@@ -109,7 +109,7 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
     STRIDE, ADJOINT_STRIDE = wp.constant(EDGE_LANES), wp.constant(ADJOINT_LANES)
 
     @wp.func_native(f"""
-    wp::vec_t<{lanes}, float> x, y, z, signs, beyond;
+    wp::vec_t<{lanes}, float> x, y, z, signs, cosine_offset;
     for (int lane = 0; lane < {lanes}; ++lane) {{
         {_ENDS} {_NORMAL}
         const float least = (float){_MIN_EDGE_SINE**2} * (ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz);
@@ -120,13 +120,13 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         y.c[lane] = sign != (float)0 ? scale * ny : (float)0;
         z.c[lane] = sign != (float)0 ? scale * nz : (float)0;
         signs.c[lane] = sign;
-        beyond.c[lane] = sign != (float)0 ? (float)0 : (float)2;
+        cosine_offset.c[lane] = sign != (float)0 ? (float)0 : (float)2;
     }}
     wp::index(edges, row) = x;
     wp::index(edges, row + 1) = y;
     wp::index(edges, row + 2) = z;
     wp::index(edges, row + 3) = signs;
-    wp::index(edges, row + 4) = beyond;
+    wp::index(edges, row + 4) = cosine_offset;
     """)
     def store_edge(
         points: Vectors, a: wp.vec3, b: wp.vec3, left: int, right: int, row: int, edges: wp.array(dtype=Lane)
@@ -150,8 +150,8 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         const float before = imaginary.c[lane];
         const float after_real = inverse * (real.c[lane] * x + before * y);
         const float after = inverse * (before * x - real.c[lane] * y);
-        const float back = y > (float)0 && before < (float)0 && after >= (float)0 ? (float)1 : (float)0;
-        const float on = y < (float)0 && before >= (float)0 && after < (float)0 ? (float)1 : (float)0;
+        const float turns_down = y > (float)0 && before < (float)0 && after >= (float)0 ? (float)1 : (float)0;
+        const float turns_up = y < (float)0 && before >= (float)0 && after < (float)0 ? (float)1 : (float)0;
         const float from_line = length * (radius * radius - d * d), on_line = (float)0.5 * d * length * (begin + end);
         area.c[lane] += (float)0.5 * d * length;
         moment_x.c[lane] += from_line * toward_x + on_line * tx;
@@ -159,7 +159,7 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         moment_z.c[lane] += from_line * toward_z + on_line * tz;
         real.c[lane] = crosses ? after_real : real.c[lane];
         imaginary.c[lane] = crosses ? after : before;
-        turns.c[lane] += crosses ? on - back : (float)0;
+        turns.c[lane] += crosses ? turns_up - turns_down : (float)0;
     }}
     wp::index(sums, 0) = area;
     wp::index(sums, 1) = real;
@@ -348,7 +348,7 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         parts: ConvexArrays, silhouette: Silhouette, direction: wp.vec3, radius: float, adj: Coverages
     ):
         """Add to the gradients of the edges' normals."""
-        solid = Coverages(wp.cw_mul(silhouette.is_solid, adj.share), scale(silhouette.is_solid, adj.moment))
+        adj_where_solid = Coverages(wp.cw_mul(silhouette.is_solid, adj.share), scale(silhouette.is_solid, adj.moment))
         for k in range(silhouette.count):
             cosine = edge_cosine(silhouette, k, direction)
             if is_any_above(-wp.max(cosine, -cosine), -radius):
@@ -356,7 +356,9 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
                 a, b = silhouette.corners[edge[0]], silhouette.corners[edge[1]]
                 points, edges, adj_edges = silhouette.points, silhouette.edges, silhouette.adj_edges
                 row, adj_row = STRIDE * k, ADJOINT_STRIDE * k
-                add_chord_adjoint(points, a, b, cosine, direction, radius, solid, row, edges, adj_row, adj_edges)
+                add_chord_adjoint(
+                    points, a, b, cosine, direction, radius, adj_where_solid, row, edges, adj_row, adj_edges
+                )
 
     @wp.func
     def silhouette_adjoint(

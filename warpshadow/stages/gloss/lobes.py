@@ -95,8 +95,8 @@ def _shape_lobes(
     # out
     lobe_normals: wp.array2d(dtype=wp.vec3),
     tangents: wp.array2d(dtype=wp.vec3),
-    views: wp.array2d(dtype=wp.vec3),
-    caps: wp.array2d(dtype=wp.vec3),
+    view_terms: wp.array2d(dtype=wp.vec3),
+    cap_axes: wp.array2d(dtype=wp.vec3),
     widths: wp.array2d(dtype=wp.vec3),
     cosines: wp.array2d(dtype=wp.float32),
 ):
@@ -133,8 +133,8 @@ def _shape_lobes(
     slant = wp.length(stretched_view)
     lobe_normals[batch, receiver] = normal
     tangents[batch, receiver] = tangent
-    views[batch, receiver] = wp.vec3(sine, cosine, slant)
-    caps[batch, receiver] = stretched_view / slant
+    view_terms[batch, receiver] = wp.vec3(sine, cosine, slant)
+    cap_axes[batch, receiver] = stretched_view / slant
     widths[batch, receiver] = width
     cosines[batch, receiver] = cosine
 
@@ -144,8 +144,8 @@ class Lobes(NamedTuple):
 
     normals: wp.array
     tangents: wp.array  # the view is in the plane of these
-    views: wp.array  # sine, cosine and Λ of the view
-    caps: wp.array  # axes of the caps of mirrors of width 1, in the frame of tangent, bitangent and normal
+    view_terms: wp.array  # sine, cosine and Λ of the view
+    cap_axes: wp.array  # axes of the caps of mirrors of width 1, in the frame of tangent, bitangent and normal
     widths: wp.array  # W: xx, xy, yy
 
 
@@ -198,8 +198,8 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         # in
         normals: wp.array2d(dtype=wp.vec3),
         tangents: wp.array2d(dtype=wp.vec3),
-        views: wp.array2d(dtype=wp.vec3),
-        caps: wp.array2d(dtype=wp.vec3),
+        view_terms: wp.array2d(dtype=wp.vec3),
+        cap_axes: wp.array2d(dtype=wp.vec3),
         widths: wp.array2d(dtype=wp.vec3),
         blur_share: float,
         places: wp.array2d(dtype=wp.int32),
@@ -213,7 +213,7 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         normal = normals[batch, receiver]
         tangent = tangents[batch, receiver]
         bitangent = wp.cross(normal, tangent)
-        view = views[batch, receiver]
+        view = view_terms[batch, receiver]
         sine, cosine, slant = view[0], view[1], view[2]
         width = widths[batch, receiver]
         weight_scale = (cosine + slant) / float(directions.shape[2])
@@ -225,7 +225,7 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             height_share = sample_points[place, 0, block]
             azimuth_cosine = sample_points[place, 1, block]
             azimuth_sine = sample_points[place, 2, block]
-            cap, _radius = find_cap(caps[batch, receiver], height_share, azimuth_cosine, azimuth_sine)
+            cap, _radius = find_cap(cap_axes[batch, receiver], height_share, azimuth_cosine, azimuth_sine)
             mirror_x, mirror_y = stretch(width, cap.x, cap.y)
             upright = wp.cw_mul(cap.z, cap.z)
             square = wp.cw_mul(mirror_x, mirror_x) + wp.cw_mul(mirror_y, mirror_y) + upright
@@ -262,8 +262,8 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         # in
         normals: wp.array2d(dtype=wp.vec3),
         tangents: wp.array2d(dtype=wp.vec3),
-        views: wp.array2d(dtype=wp.vec3),
-        caps: wp.array2d(dtype=wp.vec3),
+        view_terms: wp.array2d(dtype=wp.vec3),
+        cap_axes: wp.array2d(dtype=wp.vec3),
         widths: wp.array2d(dtype=wp.vec3),
         blur_share: float,
         places: wp.array2d(dtype=wp.int32),
@@ -282,7 +282,7 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         normal = normals[batch, receiver]
         tangent = tangents[batch, receiver]
         bitangent = wp.cross(normal, tangent)
-        view = views[batch, receiver]
+        view = view_terms[batch, receiver]
         sine, cosine, slant = view[0], view[1], view[2]
         width = widths[batch, receiver]
         weight_scale = (cosine + slant) / float(adj_directions.shape[2])
@@ -309,7 +309,7 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             height_share = sample_points[place, 0, block]
             azimuth_cosine = sample_points[place, 1, block]
             azimuth_sine = sample_points[place, 2, block]
-            cap, radius = find_cap(caps[batch, receiver], height_share, azimuth_cosine, azimuth_sine)
+            cap, radius = find_cap(cap_axes[batch, receiver], height_share, azimuth_cosine, azimuth_sine)
             long_x, long_y = stretch(width, cap.x, cap.y)
             upright = wp.cw_mul(cap.z, cap.z)
             cap_square = wp.cw_mul(cap.x, cap.x) + wp.cw_mul(cap.y, cap.y) + upright
@@ -377,7 +377,7 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             adj_axis_x += adj_cap_x
             adj_axis_y += adj_cap_y
             adj_radius = wp.cw_mul(azimuth_cosine, adj_cap_x) + wp.cw_mul(azimuth_sine, adj_cap_y)
-            height = cap.z - Lane(caps[batch, receiver][2])
+            height = cap.z - Lane(cap_axes[batch, receiver][2])
             adj_height = -1.0 * wp.cw_div(wp.cw_mul(adj_radius, height), radius)
             adj_axis_z += wp.cw_mul(adj_cap_z, Lane(1.0) - height_share) - wp.cw_mul(adj_height, height_share)
         scale_rate = total(adj_weight_scale) / float(adj_directions.shape[2])

@@ -59,7 +59,7 @@ class SeparatedLight(NamedTuple):
     """A map that is separated from its suns."""
 
     suns: Suns
-    rest: np.ndarray  # the map, in which their pixels are cut to ten times its mean radiance
+    without_suns: np.ndarray  # the map, in which their pixels are cut to ten times its mean radiance
 
 
 def separate_suns(radiance: np.ndarray) -> SeparatedLight:
@@ -104,11 +104,11 @@ def separate_suns(radiance: np.ndarray) -> SeparatedLight:
                     break
         is_sun |= is_in_disc
         is_candidate &= ~(is_in_disc if is_in_disc.any() else from_brightest > np.cos(2 * _RADII[0]))
-    rest = radiance.reshape(-1, 3).copy()
-    rest[pixels[is_sun]] *= (1 - shares[is_sun])[:, None]
+    without_suns = radiance.reshape(-1, 3).copy()
+    without_suns[pixels[is_sun]] *= (1 - shares[is_sun])[:, None]
     columns = np.array([[*direction, *irradiance, size] for direction, irradiance, size in suns]).reshape(-1, 7)
     suns_of_map = Suns(columns[:, :3], columns[:, 3:6], columns[:, 6])
-    return SeparatedLight(suns_of_map, rest.reshape(radiance.shape))
+    return SeparatedLight(suns_of_map, without_suns.reshape(radiance.shape))
 
 
 def directions_in_suns(suns: Suns, count: int) -> np.ndarray:
@@ -216,7 +216,7 @@ def _reflect_suns(
     # in
     normals: wp.array2d(dtype=wp.vec3),
     tangents: wp.array2d(dtype=wp.vec3),
-    views: wp.array2d(dtype=wp.vec3),
+    view_terms: wp.array2d(dtype=wp.vec3),
     widths: wp.array2d(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
     irradiance: wp.array(dtype=wp.vec3),
@@ -235,7 +235,7 @@ def _reflect_suns(
     normal = normals[lobe_batch, receiver]
     tangent = tangents[lobe_batch, receiver]
     bitangent = wp.cross(normal, tangent)
-    view = views[lobe_batch, receiver]
+    view = view_terms[lobe_batch, receiver]
     width = widths[lobe_batch, receiver]
     count = transmittance.shape[2] / directions.shape[0]  # directions of each sun
     transmittance_batch = instance_in(batch, transmittance.shape[0])
@@ -274,7 +274,7 @@ def add_suns(lobe_light: LobeLight, lobes: Lobes, suns: Suns, transmittance: wp.
     arrays = {"lobe_light": lobe_light.straight, "lobes": lobes.normals, "transmittance": transmittance}
     count, receiver_count = common_batch(arrays), lobe_light.straight.shape[1]
     sums = LobeLight(*(empty((count, receiver_count), dtype=wp.vec3, device=device) for _ in range(2)))
-    of_lobes = [lobes.normals, lobes.tangents, lobes.views, lobes.widths]
+    of_lobes = [lobes.normals, lobes.tangents, lobes.view_terms, lobes.widths]
     of_suns = [
         constant(suns.directions, wp.vec3, device),
         constant(suns.irradiance, wp.vec3, device),

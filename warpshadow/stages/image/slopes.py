@@ -142,7 +142,7 @@ def _let_follow(
 
 
 @wp.kernel(enable_backward=False)
-def _find_mean_slopes(
+def _find_outline_samples(
     # in
     samples: wp.array(dtype=wp.int32),
     fragments: FragmentArrays,
@@ -182,7 +182,9 @@ def _find_mean_slopes(
                         _let_follow(fragments, entries, edges, sides, keys, has_mean_slope, end)
 
 
-def find_mean_slopes(silhouettes: Silhouettes, clip_positions: wp.array, quadtree: Quadtree | None = None) -> wp.array:
+def find_outline_samples(
+    silhouettes: Silhouettes, clip_positions: wp.array, quadtree: Quadtree | None = None
+) -> wp.array:
     """Find the samples that follow their surface by mean slopes although they are receivers.
 
     Args:
@@ -200,7 +202,7 @@ def find_mean_slopes(silhouettes: Silhouettes, clip_positions: wp.array, quadtre
     arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
     keys = None if quadtree is None else quadtree.square_key_of_side
     inputs = [silhouettes.samples, arrays, silhouettes.entries, silhouettes.edges, reshaped(sides, (-1,)), keys, REACH]
-    launch(_find_mean_slopes, silhouettes.samples.size, inputs=inputs, outputs=[reshaped(has_mean_slope, (-1,))])
+    launch(_find_outline_samples, silhouettes.samples.size, inputs=inputs, outputs=[reshaped(has_mean_slope, (-1,))])
     return has_mean_slope
 
 
@@ -218,11 +220,11 @@ def _add_gradients_of_points(
         adj_barycentrics[view, sample] += adj_held[view, sample]
 
 
-def hold_fragments(fragments: Fragments, has_mean_slope: wp.array) -> Fragments:
+def detach_near_outlines(fragments: Fragments, has_mean_slope: wp.array) -> Fragments:
     """Fragments by which a color moves with its point, but at samples where its mean slope tells how it moves.
 
     Args:
-        has_mean_slope: Of :func:`find_mean_slopes`.
+        has_mean_slope: Of :func:`find_outline_samples`.
 
     Differentiable: barycentrics of the other samples.
     """
@@ -388,8 +390,8 @@ def moving_radiance(
         silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`.
         clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex].
         receivers: As for :func:`warpshadow.stages.silhouettes.edge_colors.find_edge_colors`.
-        has_mean_slope: Of :func:`find_mean_slopes`, if the receivers were found with it.
-        albedo_has_mean_slope: The same without a quadtree, if albedo was found by :func:`hold_fragments`.
+        has_mean_slope: Of :func:`find_outline_samples`, if the receivers were found with it.
+        albedo_has_mean_slope: The same without a quadtree, if albedo was found by :func:`detach_near_outlines`.
     Returns:
         Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width]; and the edge colors, with which
         :func:`warpshadow.stages.silhouettes.smooth.smooth_silhouettes` is to be called.

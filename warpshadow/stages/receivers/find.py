@@ -101,7 +101,7 @@ def _gather_points(
     vertices: wp.array(dtype=wp.int32),
     fragment_sides: wp.array2d(dtype=wp.int32),
     fragment_barycentrics: wp.array2d(dtype=wp.vec3),
-    rises: bool,
+    lifts_to_smooth_surface: bool,
     clip_positions: wp.array2d(dtype=wp.vec4),
     footprint_widths: wp.array(dtype=wp.float32),
     pixel: wp.vec2,
@@ -126,7 +126,7 @@ def _gather_points(
         side = fragment_sides[fragment_batch, fragment]
         face, is_back = split_side(wp.max(side, 0), faces.shape[0])
         point = interpolate_at(positions[position_batch], faces[face], weights)
-        if rises:
+        if lifts_to_smooth_surface:
             front, back = _rise_to_smooth_surface(
                 positions[position_batch], normals[position_batch], faces[face], weights
             )
@@ -246,12 +246,12 @@ def find_receivers(
     faces: wp.array,
     fragments: Fragments,
     numbering: Numbering,
-    wants_samples: np.ndarray,
+    has_sample_receivers: np.ndarray,
     bodies: np.ndarray | None = None,
     supersampling: int = 1,
     quadtree: Quadtree | None = None,
     smooth_pieces: wp.array | None = None,
-    rises: bool = False,
+    lifts_to_smooth_surface: bool = False,
     has_mean_slope: wp.array | None = None,
     shares_receivers: np.ndarray | None = None,
     footprint_inputs: FootprintInputs | None = None,
@@ -265,14 +265,14 @@ def find_receivers(
         fragments: Of one batch for all, or of one each.
         numbering: The vertices that are receivers: those of faces that a sample sees, unless the face wants samples;
             with their backs where fragments have sides.
-        wants_samples: Faces whose samples have receivers of their own, bool of shape [face].
+        has_sample_receivers: Faces whose samples have receivers of their own, bool of shape [face].
         bodies: Body of each face, −1 for faces that need not be told apart, shape [face]; None where all share their
             blockers, as for :func:`number_receivers`.
         supersampling: Samples of a pixel across and down: samples of a pixel with the same face share a receiver.
         quadtree: Squares in which samples of faces that want them interpolate; None for none.
         smooth_pieces: Smooth piece of each face, int32 of shape [face], where samples that see different faces of one
             share a receiver, too; None where they do not.
-        rises: Whether receivers of samples, from which rays leave, are lifted from flat faces onto
+        lifts_to_smooth_surface: Whether receivers of samples, from which rays leave, are lifted from flat faces onto
             the curved surface that the vertex normals describe.
         has_mean_slope, shares_receivers: As for :func:`.sample_receivers.find_sample_receivers`.
         footprint_inputs: By which those of samples have footprints; None where all are points.
@@ -289,14 +289,14 @@ def find_receivers(
     triangles = np.empty((0, 3), np.int32)
     side_count, receiver_count = receiver_of_vertex.size // positions.shape[1] * len(faces), numbering.receiver_count
     count = side_count
-    if wants_samples.any():
+    if has_sample_receivers.any():
         batch_count = common_batch({"positions": positions, "fragments": sides})
         body_keys = np.zeros(len(faces), int) if bodies is None else bodies
         surface = None
         if smooth_pieces is not None and len(positions) == 1:
             visible_points = points_of_fragments(positions, normals, faces, Fragments(*receiver_fragments.rows))
             surface = VisibleSurface(*visible_points[:2], positions[0], faces, smooth_pieces)
-        arguments = receiver_fragments, side_count, wants_samples, body_keys, supersampling, quadtree, surface
+        arguments = receiver_fragments, side_count, has_sample_receivers, body_keys, supersampling, quadtree, surface
         sample_receivers = find_sample_receivers(*arguments, has_mean_slope, shares_receivers)
         receiver_fragments, sample_fragments = sample_receivers.fragments, sample_receivers.sample_fragments
         moving_count = numbering.moving_count
@@ -316,7 +316,14 @@ def find_receivers(
     if bodies is None or sample_fragments is None or not sample_fragments.face_ids.size:
         footprint_inputs = None
     points, point_normals, footprints = _gather_receiver_points(
-        batch_count, positions, normals, faces, vertices, sample_fragments, footprint_inputs, rises=rises
+        batch_count,
+        positions,
+        normals,
+        faces,
+        vertices,
+        sample_fragments,
+        footprint_inputs,
+        lifts_to_smooth_surface=lifts_to_smooth_surface,
     )
     receivers = Receivers(
         points,
@@ -344,7 +351,7 @@ def _gather_receiver_points(
     sample_fragments: Fragments | None,
     footprint_inputs: FootprintInputs | None = None,
     *,
-    rises: bool = False,
+    lifts_to_smooth_surface: bool = False,
 ) -> tuple[wp.array, wp.array, wp.array | None]:
     """Points and normals of vertices and of fragments, for a number of instances; and footprints, if there are inputs.
 
@@ -367,7 +374,7 @@ def _gather_receiver_points(
             vertices,
             sample_fragments.face_ids,
             sample_fragments.barycentrics,
-            rises,
+            lifts_to_smooth_surface,
             *(footprint_inputs or FootprintInputs()),
         ],
         outputs=[points, point_normals, footprints],

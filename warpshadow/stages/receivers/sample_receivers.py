@@ -83,7 +83,7 @@ def _find_owner_samples(
     normals: wp.array2d(dtype=wp.vec3),
     pieces: wp.array(dtype=wp.int32),
     barycentrics: wp.array2d(dtype=wp.vec3),
-    wants_samples: wp.array(dtype=wp.bool),
+    has_sample_receivers: wp.array(dtype=wp.bool),
     shares_receivers: wp.array(dtype=wp.bool),
     sizes: wp.array3d(dtype=wp.int32),
     receiver_numbers: wp.array3d(dtype=wp.int32),
@@ -151,7 +151,7 @@ def _find_owner_samples(
                     if u + v > 1.0:
                         owner_sample -= 1
                         weight = wp.vec3(u + v - 1.0, 1.0 - u, 1.0 - v)
-                elif side >= 0 and wants_samples[side % wants_samples.shape[0]]:
+                elif side >= 0 and has_sample_receivers[side % has_sample_receivers.shape[0]]:
                     owner_sample = sample
                     weight = wp.vec3(1.0, 0.0, 0.0)
                     other_count = i * supersampling + j
@@ -222,7 +222,7 @@ def _number_fragments(
 def find_sample_receivers(
     fragments: Fragments,
     side_count: int,
-    wants_samples: np.ndarray,
+    has_sample_receivers: np.ndarray,
     bodies: np.ndarray,
     supersampling: int,
     quadtree: Quadtree | None = None,
@@ -238,7 +238,7 @@ def find_sample_receivers(
     Args:
         fragments: Sides that samples see, and barycentrics.
         side_count: Faces that receivers at vertices have.
-        wants_samples: Faces whose samples have receivers, bool of shape [face].
+        has_sample_receivers: Faces whose samples have receivers, bool of shape [face].
         bodies: Body of each face, −1 for faces that need not be told apart, shape [face].
         quadtree: Squares at whose corners there are receivers; None for none.
         surface: Visible surface of one instance, where samples of a pixel share a receiver if they see different faces
@@ -267,7 +267,7 @@ def find_sample_receivers(
             sides,
             *((surface.points, surface.normals, surface.pieces) if surface else (None, None, None)),
             barycentrics,
-            constant(wants_samples, wp.bool, device),
+            constant(has_sample_receivers, wp.bool, device),
             None if shares_receivers is None else constant(shares_receivers, wp.bool, device),
             sizes,
             squares,
@@ -279,7 +279,7 @@ def find_sample_receivers(
         ],
         outputs=[owner_samples, weights, is_owner],
     )
-    body_ids, body_ranks, ranks_on_device = _body_ranks(bodies, wants_samples, device)
+    body_ids, body_ranks, ranks_on_device = _body_ranks(bodies, has_sample_receivers, device)
     triangles = np.empty((0, 3), np.int32)
     receiver_numbers, ends = None, sample_count * np.arange(len(body_ids) + 1)
     if not device.is_capturing:
@@ -349,10 +349,10 @@ def places_in_pixels(samples: wp.array, width: int, supersampling: int) -> wp.ar
 
 @cached_by_values
 def _body_ranks(
-    bodies: np.ndarray, wants_samples: np.ndarray, device: wp.DeviceLike
+    bodies: np.ndarray, has_sample_receivers: np.ndarray, device: wp.DeviceLike
 ) -> tuple[np.ndarray, np.ndarray, wp.array]:
     """The bodies whose samples have receivers, and the rank among them of each face's body; that on the device, too."""
-    body_ids = np.unique(bodies[wants_samples])
+    body_ids = np.unique(bodies[has_sample_receivers])
     body_ranks = np.searchsorted(body_ids, bodies)
     return body_ids, body_ranks, constant(body_ranks, wp.int32, device)
 
