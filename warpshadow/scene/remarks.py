@@ -170,7 +170,7 @@ def _is_ground(body: Body, box: _Box) -> bool:
 def rounded_edges(scene: Scene) -> list[str]:
     """Say which bodies have many sharp edges whose faces share vertices, and so normals, where much of them shows it.
 
-    Vases of 16 to 128 sides, where it is the lip, have up to 0.065 and are up to 5% off; a box of 3,000 faces 0.093 and
+    Vases of 16 to 128 sides, where it is the lip, have up to 0.065 and are up to 7% off; a box of 3,000 faces 0.093 and
     17%, a bottle of flat shoulders 0.21 and 9%, a cube 0.87 and 50%.
     """
     return [
