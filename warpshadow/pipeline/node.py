@@ -6,9 +6,10 @@ good for one playback), says ``caches=False``, as samples do, or the call does n
 Inputs never change; a new value is a new input, with new nodes after it.
 """
 
+import contextlib
 import operator
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
@@ -283,7 +284,8 @@ class Call(dict[Node, Any]):
         self._clock = clock
         self._timings: dict[str, Timing] = {}
 
-    def timed(self, name: str, *, is_marked: bool) -> AbstractContextManager[None]:
+    @contextlib.contextmanager
+    def timed(self, name: str, *, is_marked: bool) -> Iterator[None]:
         """Time a stage, or one more part of a stage that has run in this call.
 
         Its adjoint is timed by marks on the tape.
@@ -291,28 +293,18 @@ class Call(dict[Node, Any]):
         timing = self._timings.get(name)
         if timing is None:
             timing = self._timings[name] = self._clock.timings[name] = Timing()
-        return _Stopwatch(timing, self._clock.now, is_marked)
+        part, now = object(), self._clock.now
 
+        def end_adjoint() -> None:
+            timing.adjoints[part] += now()
 
-class _Stopwatch(AbstractContextManager[None]):
-    """Times a part of a stage, and its adjoint if that is marked on the tape."""
+        def start_adjoint() -> None:
+            timing.adjoints[part] = -now()
 
-    def __init__(self, timing: Timing, now: Callable[[], float], is_marked: bool):
-        self._timing, self._now, self._is_marked = timing, now, is_marked
-
-    def __enter__(self) -> None:
-        if self._is_marked:
-            record(self._end_adjoint)  # the tape plays back from the end
-        self._start = self._now()
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            if self._is_marked:
-                record(self._start_adjoint)
-            self._timing.forward += self._now() - self._start
-
-    def _end_adjoint(self) -> None:
-        self._timing.adjoints[self] += self._now()
-
-    def _start_adjoint(self) -> None:
-        self._timing.adjoints[self] = -self._now()
+        if is_marked:
+            record(end_adjoint)  # the tape plays back from the end
+        start = now()
+        yield
+        if is_marked:
+            record(start_adjoint)
+        timing.forward += now() - start
