@@ -455,17 +455,12 @@ def shape(name: str, got: tuple[int, ...], expected: tuple[int | str, ...], mean
 
     If ``meaning`` is given, the message ends with it and with how to make such an array.
     """
-    if got != expected and not _fits(got, expected):
+    matches = len(got) == len(expected) and all(
+        isinstance(length, str) or got_length == length for got_length, length in zip(got, expected, strict=True)
+    )
+    if not matches:
         lengths = ", ".join(map(str, expected))
         raise ValueError(f"{name}: got shape {tuple(got)}, expected [{lengths}]{meaning and f': {meaning}'}")
-
-
-@functools.lru_cache(maxsize=4096)
-def _fits(got: tuple[int, ...], expected: tuple[int | str, ...]) -> bool:
-    pairs = zip(got, expected, strict=False)
-    return len(got) == len(expected) and all(
-        isinstance(length, str) or got_length == length for got_length, length in pairs
-    )
 
 
 def importable(module: str, feature: str, package: str, extra: str) -> None:

@@ -21,10 +21,7 @@ def common_batch(arrays: Mapping[str, Any]) -> int:
         ValueError: naming the array whose length is another.
     """
     counts = {name: len(array) for name, array in arrays.items() if array is not None}
-    batches = set(counts.values()) - {1}
-    if len(batches) < 2:
-        return batches.pop() if batches else 1
-    first, count = next(item for item in counts.items() if item[1] != 1)
+    first, count = next(((name, count) for name, count in counts.items() if count != 1), ("", 1))
     for name, got in counts.items():
         if got not in (1, count):
             item, second = (of.replace("geometry.positions", "the poses of geometry") for of in (first, name))
