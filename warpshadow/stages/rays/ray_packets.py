@@ -24,7 +24,7 @@ PACKET = CHUNK  # rays of a packet
 _ALL_RAYS = wp.constant((1 << PACKET) - 1)  # their bits
 
 Hits = wp.types.vector(length=PACKET, dtype=wp.int32)
-"""What each ray of a packet meets first: 2 face + 1 for its back, the face numbered as in the tree; −1 for no face, and
+"""First face that each ray of a packet meets: 2 face + 1 for its back, the face numbered as in the tree; −1 for no face, and
 for the one that the receiver lies on."""
 
 _LEAF = 4  # faces of a leaf at most
@@ -124,7 +124,7 @@ def _make_traverse(meet_face: str, result: str, result_type: type) -> wp.Functio
 
     Args:
         meet_face: C++ for a face and a lane, whose ray ends there, or reaches only that far, if it meets it.
-        result: C++ that returns what was found.
+        result: C++ that returns the rays that left, or the faces found.
     """
     Vectors = vectors_type(PACKET)
 
