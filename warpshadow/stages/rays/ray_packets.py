@@ -24,8 +24,9 @@ PACKET = CHUNK  # rays of a packet
 _ALL_RAYS = wp.constant((1 << PACKET) - 1)  # their bits
 
 Hits = wp.types.vector(length=PACKET, dtype=wp.int32)
-"""First face that each ray of a packet meets: 2 face + 1 for its back, the face numbered as in the tree; −1 for no face, and
-for the one that the receiver lies on."""
+"""First face that each ray of a packet meets: 2 face + 1 for its back, the face numbered as in the tree.
+
+−1 for no face, and for the one that the receiver lies on."""
 
 _LEAF = 4  # faces of a leaf at most
 
