@@ -17,6 +17,7 @@ from warpshadow.device.lanes import (
     Chunk,
     as_chunks,
     block_count,
+    is_positive_in_chunk,
     lane_count,
     lane_type,
     make_lane_functions,
@@ -47,7 +48,8 @@ wp.set_module_options({"max_unroll": 1})
 def _make_sh_transfer(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
     fn = make_lane_functions(lanes)
-    find_block, dot, load, load_rows, store_rows = fn.find_block, fn.dot, fn.load, fn.load_rows, fn.store_rows
+    find_block, dot, is_positive, load = fn.find_block, fn.dot, fn.is_positive, fn.load
+    load_rows, store_rows = fn.load_rows, fn.store_rows
     add_rotated_zonal, multiply = make_add_rotated_zonal(order, lanes), make_multiply(order, lanes)
     COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
 
@@ -73,7 +75,7 @@ def _make_sh_transfer(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
             cosine[i] = Lane(0.0)
         normal = load(normals[batch], block)
         # there is no cosine around a zero normal
-        is_there = wp.min(dot(normal, normal) * 1.0e30, Lane(1.0))
+        is_there = is_positive(dot(normal, normal))
         zonal = Zonal()
         for band in range(order):
             zonal[band] = COSINE[band] * is_there
@@ -94,8 +96,8 @@ def _make_sh_transfer(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
 def _make_sh_transfer_adjoint(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
     Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
     fn = make_lane_functions(lanes)
-    find_block, dot, load, load_rows = fn.find_block, fn.dot, fn.load, fn.load_rows
-    add_rows, add_vectors = fn.add_rows, fn.add_vectors
+    find_block, dot, is_positive, load = fn.find_block, fn.dot, fn.is_positive, fn.load
+    load_rows, add_rows, add_vectors = fn.load_rows, fn.add_rows, fn.add_vectors
     add_rotated_zonal, multiply = make_add_rotated_zonal(order, lanes), make_multiply(order, lanes)
     rotated_zonal_adjoint = make_rotated_zonal_adjoint(order, lanes)
     COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
@@ -123,7 +125,7 @@ def _make_sh_transfer_adjoint(order: int, is_shadowed: bool, lanes: int) -> wp.K
         factor = scratch[slot, 1]
         product = scratch[slot, 2]
         normal = load(normals[batch], block)
-        is_there = wp.min(dot(normal, normal) * 1.0e30, Lane(1.0))
+        is_there = is_positive(dot(normal, normal))
         zonal = Zonal()
         for band in range(order):
             zonal[band] = COSINE[band] * is_there
@@ -300,7 +302,7 @@ def transfer_chunk_adjoint(
     cosine = wp.cw_mul(nx, x) + wp.cw_mul(ny, y) + wp.cw_mul(nz, z)
     weighted = weight * adj
     wp.adjoint[transmittance] += wp.cw_mul(weighted, wp.max(cosine, Chunk(0.0)))
-    is_up = wp.min(wp.max(cosine * 1.0e30, Chunk(0.0)), Chunk(1.0))
+    is_up = is_positive_in_chunk(cosine)
     adj_cosine = wp.cw_mul(wp.cw_mul(weighted, transmittance), is_up)
     wp.adjoint[nx] += wp.cw_mul(adj_cosine, x)
     wp.adjoint[ny] += wp.cw_mul(adj_cosine, y)
