@@ -19,10 +19,10 @@ from warpshadow.cli import app
 from warpshadow.dataset import Recipe, load_recipe
 from warpshadow.inverse.fit_file import load_fit
 from warpshadow.maths.directions import fibonacci
+from warpshadow.maths.suns import _MAX_SUNS
 from warpshadow.pipeline.views import scene_views
 from warpshadow.scene import blockers
 from warpshadow.scene.visibility import DIRECTIONS
-from warpshadow.stages.gloss.suns import _MAX_SUNS
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -49,8 +49,10 @@ FACTORIES: dict[str, Callable[[], wp.Kernel]] = {
         for has_horizon, has_footprints in ((False, False), (True, False), (True, True))
     },
     **{
-        f"{make.__name__} {order} {is_shadowed}": partial(make, order, is_shadowed, LANES)
-        for make in (transfer._make_sh_transfer, transfer._make_sh_transfer_adjoint)
+        f"_make_sh_transfer {name} {order} {is_shadowed}": lambda k=k, arguments=(order, is_shadowed, LANES): (
+            transfer._make_sh_transfer(*arguments)[k]
+        )
+        for k, name in enumerate(("kernel", "adjoint"))
         for order, is_shadowed in [(2, True), (8, True), (8, False)]
     },
     **{f"_make_sh_product {order}": partial(transfer._make_sh_product, order, LANES) for order in ORDERS},

@@ -243,7 +243,8 @@ def _sum_of_halves(lanes: int) -> str:
     return "\n".join([*lines, "return part_1;"])
 
 
-@wp.func_native(f"""
+@wp.func_native(
+    f"""
 #if defined(__CUDA_ARCH__)
     float sum = value.c[0];
     for (int k = 1; k < {CHUNK}; ++k)
@@ -252,10 +253,21 @@ def _sum_of_halves(lanes: int) -> str:
 #else
 {_sum_of_halves(CHUNK)}
 #endif
-""")
+""",
+    adj_snippet=f"""
+    for (int k = 0; k < {CHUNK}; ++k)
+        adj_value.c[k] += adj_ret;
+""",
+)
 def total_of_chunk(value: Chunk) -> float:  # type: ignore[empty-body, valid-type]
-    """Sum of a chunk, on any device."""
+    """Sum of a chunk, on any device. Differentiable."""
     ...
+
+
+@wp.func(inline=True)
+def is_positive_in_chunk(value: Chunk):
+    """1 where an item of a chunk is above 0, else 0."""
+    return wp.min(wp.max(1.0e30 * value, Chunk(0.0)), Chunk(1.0))
 
 
 def _on_columns(statement: str, lanes: int) -> str:

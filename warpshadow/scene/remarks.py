@@ -12,13 +12,12 @@ from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.topology import CREASE
 from warpshadow.maths.plane import plane_normal
 from warpshadow.maths.solid_angle import solid_angles
+from warpshadow.maths.suns import separate_suns
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene
 
 _GROUND_COSINE = 0.99  # cosine of the angle to +y up to which a flat body is a ground
 _CEILING_RATIO = 1.01  # ratio of breadths up to which a body is as broad as its ground, such as a ceiling
-_SUN_SHARE = 0.01  # of all directions, from which half of the light comes where there is a sun
-_ONE_SUN = 0.99  # length of the mean direction of that light from which on it is one sun: two are apart
 _LOW_SUN = -0.02  # height of the direction to a sun from which on it is below the horizon, by more than its rim
 _MARGIN = 3.0  # breadths of the frame around its middle in which a body's shadow may be meant to be seen alone
 _ROUNDED = 0.08  # mean difference of normals from which rounded edges are said
@@ -191,15 +190,8 @@ def lined_surfaces(scene: Scene) -> list[str]:
     ]
 
 
-class _BrightestHalf(NamedTuple):
-    """The brightest pixels of a map, from which half of its light comes."""
-
-    pixels: np.ndarray  # numbers, from the brightest on
-    powers: np.ndarray  # mean radiance times solid angle, of each of them
-    share: float  # of all directions, that they cover
-
-
-def _brightest_half(light: EnvironmentMap) -> _BrightestHalf:
+def _share_of_brightest_half(light: EnvironmentMap) -> float:
+    """Share of all directions from which half of the light of a map comes, the brightest ones."""
     solid_angles = np.repeat(light.solid_angles(), light.radiance.shape[1])
     luminances = light.radiance.reshape(-1, 3) @ np.full(3, 1 / 3)
     half_power = solid_angles @ luminances / 2
@@ -211,8 +203,7 @@ def _brightest_half(light: EnvironmentMap) -> _BrightestHalf:
     candidates = candidates[(-luminances[candidates]).argsort()]
     powers = (luminances * solid_angles)[candidates]
     end = int(np.searchsorted(powers.cumsum(), half_power)) + 1
-    pixels = candidates[:end]
-    return _BrightestHalf(pixels, powers[:end], float(solid_angles[pixels].sum() / (4 * np.pi)))
+    return float(solid_angles[candidates[:end]].sum() / (4 * np.pi))
 
 
 def blurred_shell(scene: Scene) -> list[str]:
@@ -223,7 +214,7 @@ def blurred_shell(scene: Scene) -> list[str]:
     light = scene.known_light
     if scene.shell is None or not scene.visibility.traits.has_cells or not isinstance(light, EnvironmentMap):
         return []
-    share = _brightest_half(light).share
+    share = _share_of_brightest_half(light)
     if share * scene.direction_count >= 1:
         return []
     return [
@@ -234,21 +225,20 @@ def blurred_shell(scene: Scene) -> list[str]:
 
 
 def sun_below(scene: Scene) -> list[str]:
-    """Remark on a map whose sun is below the horizon, where a body that casts shadows is a ground, broader than all."""
+    """Remark on a map half of whose light is a sun's below the horizon, over a ground that is broader than all."""
     light = scene.known_light
     if not isinstance(light, EnvironmentMap) or light.shell is not None or len(scene.bodies) < 2:
         return []
     grounds = grounds_of(scene)
     if not grounds:
         return []
-    half = _brightest_half(light)
-    if not half.powers.sum() or half.share > _SUN_SHARE:
+    directions, irradiance, _ = separate_suns(light.radiance).suns
+    powers = irradiance.mean(axis=1)
+    half_power = light.solid_angles() @ light.radiance.mean(axis=2).sum(axis=1) / 2
+    low_suns = directions[(powers > half_power) & (directions[:, 1] < _LOW_SUN)]
+    if not len(low_suns):
         return []
-    direction = half.powers @ light.directions().reshape(-1, 3)[half.pixels] / half.powers.sum()
-    length = np.linalg.norm(direction)
-    if length < _ONE_SUN or direction[1] > _LOW_SUN:
-        return []
-    x, y, z = (direction / length).tolist()
+    x, y, z = low_suns[0].tolist()
     number = grounds[0]
     return [
         f"light: its sun is at ({x:.2g}, {y:.2g}, {z:.2g}), below body {number} ({scene.bodies[number].name!r}), which "

@@ -5,8 +5,7 @@ its own, which is called once, with all images of its scene. One scene of all bo
 ones it does not show, would take five times as long.
 """
 
-import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -99,7 +98,7 @@ class MixedRenderer(torch.nn.Module):
         Differentiable: all but which.
         """
         batch = _Batch(which, len(self.renderers))
-        whole_inputs = {name: batch.split(name, *entry) for name, entry in inputs.of_images.items()}
+        of_images = {name: batch.split(name, *entry) for name, entry in inputs.of_images.items()}
         of_bodies = {
             name: {
                 body: self._split_item(batch, name, body, tensor)
@@ -108,18 +107,19 @@ class MixedRenderer(torch.nn.Module):
             for name, values in inputs.of_bodies.items()
         }
         geometries = batch.of_scenes(inputs.geometry)
-        images_of_scenes = {}
-        for scene in batch.rows:
-            counts = self._vertex_counts[scene]
-            images_of_scenes[scene] = self._renderer(scene)(
-                **{name: of_scene(scene) for name, of_scene in whole_inputs.items()},
-                **{
-                    name: {body: of_scene(scene) for body, of_scene in items.items() if body in counts}
-                    for name, items in of_bodies.items()
-                },
-                geometry=geometries[scene],
-            )
-        return batch.join(images_of_scenes)
+        return batch.join(
+            {
+                scene: self._renderer(scene)(
+                    **{name: parts[scene] for name, parts in of_images.items()},
+                    **{
+                        name: {body: parts[scene] for body, parts in items.items() if scene in parts}
+                        for name, items in of_bodies.items()
+                    },
+                    geometry=geometries[scene],
+                )
+                for scene in batch.rows
+            }
+        )
 
     @outside_torch_compile
     def placed(
@@ -144,25 +144,22 @@ class MixedRenderer(torch.nn.Module):
         Differentiable: rotations, translations, scales.
         """
         batch = _Batch(which, len(self.renderers))
-        arguments = {"rotations": (rotations, (3, 3)), "translations": (translations, (3,)), "scales": (scales, ())}
         poses = [
-            batch.split(name, self._checked_poses(name, *entry), 1 + len(entry[1])) for name, entry in arguments.items()
+            self._split_poses(batch, "rotations", rotations, (3, 3)),
+            self._split_poses(batch, "translations", translations, (3,)),
+            self._split_poses(batch, "scales", scales, ()),
         ]
         bodies = None if moving is None else self._check_bodies("moving", moving)
         geometries = _Placed([None] * len(self.renderers))
         if any(
-            tensor is not None and tensor.ndim > 1 + len(item) and len(tensor) > 1
-            for tensor, item in arguments.values()
+            tensor is not None and tensor.ndim > ndim and len(tensor) > 1
+            for tensor, ndim in ((rotations, 3), (translations, 2), (scales, 1))
         ):
             geometries.which = batch.numbers
         for scene in batch.rows:
-            renderer, counts = self._renderer(scene), self._vertex_counts[scene]
-            R, t, s = (
-                _without_padding(of_scene(scene), ndim, len(renderer.scene.bodies))
-                for of_scene, ndim in zip(poses, (3, 2, 1), strict=True)
-            )
-            moved = None if bodies is None else [body for body in bodies if body in counts]
-            geometries[scene] = renderer.placed(R, t, s, moving=moved, pivot=pivot)
+            moved = None if bodies is None else [body for body in bodies if body in self._vertex_counts[scene]]
+            R, t, s = (parts[scene] for parts in poses)
+            geometries[scene] = self._renderer(scene).placed(R, t, s, moving=moved, pivot=pivot)
         return geometries
 
     @outside_torch_compile
@@ -222,50 +219,47 @@ class MixedRenderer(torch.nn.Module):
             return {}
         if isinstance(tensors, Mapping):
             self._check_bodies(argument, tensors)
-            pairs = tensors.items()
         else:
-            check.instance(
-                argument, tensors, (list, tuple), f"a list of {self._body_count} items, or a mapping by bodies"
-            )
-            if len(tensors) != self._body_count:
+            count = self._body_count
+            check.instance(argument, tensors, (list, tuple), f"a list of {count} items, or a mapping by bodies")
+            if len(tensors) != count:
                 raise ValueError(
-                    f"{argument}: got {len(tensors)} items, expected {self._body_count}, "
-                    "one for each body of the scene with the most"
+                    f"{argument}: got {len(tensors)} items, expected {count}, one for each body of the scene with the "
+                    "most"
                 )
-            pairs = dict(enumerate(tensors)).items()
-        return {body: tensor for body, tensor in pairs if tensor is not None}
+            tensors = dict(enumerate(tensors))
+        return {body: tensor for body, tensor in tensors.items() if tensor is not None}
 
-    def _split_item(self, batch: "_Batch", argument: str, body: BodyLike, tensor: Any) -> Callable[[int], Any]:
-        """An input of a body for the images of a scene, checked; without padding where it is of vertices."""
+    def _split_item(self, batch: "_Batch", argument: str, body: BodyLike, tensor: Any) -> dict[int, Any]:
+        """An input of a body for the images of each scene that has it, checked; without padding where of vertices."""
         name, maximum = f"{argument}[{body!r}]", self._maximum_vertices[body]
-        body_input = INPUTS_OF_BODIES[argument]
+        body_input, shape = INPUTS_OF_BODIES[argument], np.shape(tensor)
+        counts = {scene: self._vertex_counts[scene][body] for scene in batch.rows if body in self._vertex_counts[scene]}
+        ndim = 2 if body_input.is_color else 1
         if body_input.has_rows:
             check_float32(name, tensor)
-        if body_input.is_image(np.shape(tensor), maximum):
-            return batch.split(name, tensor, 3 if body_input.is_color else 2)
-        if not body_input.is_color:
-            if tensor.ndim == 1 and len(tensor) != 1:
-                check.shape(name, tuple(tensor.shape), (maximum,), "or one number, or an image")
-            ndim = 1
-        else:
-            if tensor.ndim > 1 and tensor.shape[-2] != 1:
-                shape = ("batch", maximum, 3) if tensor.ndim > 2 else (maximum, 3)
-                meaning = f"or one color; the mesh with the most vertices has {maximum}"
-                check.shape(name, tuple(tensor.shape), shape, meaning)
-            ndim = 2
-        of_scene = batch.split(name, tensor, ndim)
-        return lambda scene: _without_padding(of_scene(scene), ndim, self._vertex_counts[scene][body])
+        if body_input.is_image(shape, maximum):
+            parts = batch.split(name, tensor, ndim + 1)
+            return {scene: parts[scene] for scene in counts}
+        if body_input.is_color and len(shape) > 1 and shape[-2] != 1:
+            meaning = f"or one color; the mesh with the most vertices has {maximum}"
+            check.shape(name, shape, (maximum, 3) if len(shape) == 2 else ("batch", maximum, 3), meaning)
+        elif not body_input.is_color and len(shape) == 1 and shape[0] != 1:
+            check.shape(name, shape, (maximum,), "or one number, or an image")
+        return batch.split(name, tensor, ndim, counts)
 
-    def _checked_poses(self, name: str, poses: torch.Tensor | None, item: tuple[int, ...]) -> torch.Tensor | None:
-        """Poses of as many bodies as the scene with the most has."""
+    def _split_poses(
+        self, batch: "_Batch", name: str, poses: torch.Tensor | None, item: tuple[int, ...]
+    ) -> dict[int, Any]:
+        """Poses for the images of each scene, given for as many bodies as the scene with the most has."""
         if poses is None:
-            return None
+            return dict.fromkeys(batch.rows)
         check_float32(name, poses)
         shape = self._body_count, *item
-        has_batch = poses.ndim > len(shape)
-        meaning = "for as many bodies as the scene with the most has"
-        check.shape(name, tuple(poses.shape), ("batch", *shape) if has_batch else shape, meaning)
-        return poses
+        expected: tuple[int | str, ...] = shape if poses.ndim <= len(shape) else ("batch", *shape)
+        check.shape(name, tuple(poses.shape), expected, "for as many bodies as the scene with the most has")
+        counts = {scene: len(self._renderer(scene).scene.bodies) for scene in batch.rows}
+        return batch.split(name, poses, len(shape), counts)
 
 
 class _Batch:
@@ -282,22 +276,27 @@ class _Batch:
         for row, scene in enumerate(numbers):
             self.rows.setdefault(scene, []).append(row)
 
-    def split(self, name: str, values: Any, ndim: int) -> Callable[[int], Any]:
-        """The values of the images of a scene: all that serve every image, or their items of a batch.
+    def split(self, name: str, values: Any, ndim: int, counts: Mapping[int, int] | None = None) -> dict[int, Any]:
+        """The values of the images of each scene: all that serve every image, or their items of a batch.
 
         Args:
             name: Its name in messages.
             values: A tensor; anything else is given to all.
             ndim: Dimensions of an item.
+            counts: Of each scene that takes them, how long the first of these dimensions is without padding; None for
+                all scenes and no padding. An item of length 1 has none.
         """
-        if not isinstance(values, torch.Tensor) or values.ndim <= ndim or len(values) == 1:
-            return lambda scene: values
-        if len(values) != self.count:
-            raise ValueError(f"{name}: got a batch of {len(values)}, expected 1 or {self.count}, as which has")
-        if len(self.rows) == 1:
-            return lambda scene: values
-        items = values.unbind()  # once: the gradient of a choice of items is as large as the whole
-        return lambda scene: torch.stack([items[row] for row in self.rows[scene]])
+        parts = dict.fromkeys(self.rows if counts is None else counts, values)
+        if not isinstance(values, torch.Tensor):
+            return parts
+        if values.ndim > ndim and len(values) != 1:
+            if len(values) != self.count:
+                raise ValueError(f"{name}: got a batch of {len(values)}, expected 1 or {self.count}, as which has")
+            items = values.unbind()  # once: the gradient of a choice of items is as large as the whole
+            parts = {scene: torch.stack([items[row] for row in self.rows[scene]]) for scene in parts}
+        if counts is None or values.ndim < ndim or values.shape[-ndim] == 1:
+            return parts
+        return {scene: part.narrow(-ndim, 0, counts[scene]) for scene, part in parts.items()}
 
     def of_scenes(
         self, geometry: Sequence[Geometry[torch.Tensor] | None] | None
@@ -329,21 +328,11 @@ class _Batch:
 
     def join(self, images_of_scenes: Mapping[int, torch.Tensor]) -> torch.Tensor:
         """The images of all scenes, in the order of the batch."""
-        images = {
-            scene: image.expand(len(self.rows[scene]), *image.shape[-3:]) for scene, image in images_of_scenes.items()
-        }
-        if len(images) == 1:
-            return next(iter(images.values())).contiguous()
-        rows = itertools.chain.from_iterable(self.rows[scene] for scene in images)
-        ordered_images = dict(zip(rows, itertools.chain.from_iterable(images.values()), strict=True))
-        return torch.stack([ordered_images[row] for row in range(self.count)])
-
-
-def _without_padding(tensor: Any, ndim: int, count: int) -> Any:
-    """Without padding: the first items of the dimension that begins the last ``ndim``, unless one item serves all."""
-    if tensor is None or tensor.ndim < ndim or tensor.shape[-ndim] == 1:
-        return tensor
-    return tensor.narrow(-ndim, 0, count)
+        images: dict[int, torch.Tensor] = {}
+        for scene, image in images_of_scenes.items():
+            rows = self.rows[scene]
+            images |= zip(rows, image.expand(len(rows), *image.shape[-3:]), strict=True)
+        return torch.stack([images[row] for row in range(self.count)])
 
 
 def _as_batch(renderers: Iterable[TorchRenderer]) -> list[TorchRenderer]:

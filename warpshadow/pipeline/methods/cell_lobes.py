@@ -5,6 +5,7 @@ import functools
 import numpy as np
 import warp as wp
 
+from warpshadow.maths.suns import Suns
 from warpshadow.pipeline.methods.glossy_cells import CellMethod, shading_with_cells, transmittance_of_cells
 from warpshadow.pipeline.node import Node, field_of
 from warpshadow.pipeline.receivers.shading_context import receiver_text
@@ -12,7 +13,7 @@ from warpshadow.pipeline.shading.lobe_light import LitLobes, LobeVisibility
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis
 from warpshadow.stages.gloss.reflection import find_blocked_radiance
-from warpshadow.stages.gloss.suns import Suns, find_sun_transmittance
+from warpshadow.stages.gloss.suns import find_sun_transmittance
 from warpshadow.stages.gloss.transmittance import interpolate_transmittance
 from warpshadow.stages.light.shading import shade
 from warpshadow.stages.light.transfer import directional_transfer

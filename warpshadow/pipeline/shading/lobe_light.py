@@ -9,13 +9,13 @@ import warp as wp
 from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.batch import expand
 from warpshadow.device.constants import constant
+from warpshadow.maths.suns import SeparatedLight, Suns, directions_in_suns, separate_suns
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.node import Node, field_of
 from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.shading.glossy_points import GlossyPoints
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.stages.gloss.prefilter import prefilter
-from warpshadow.stages.gloss.suns import SeparatedLight, Suns, directions_in_suns, separate_suns
 from warpshadow.stages.receivers.find import Receivers
 
 _MIN_SAMPLES = 8  # of a receiver, however many receivers a pixel has: as many as a processor finds at once

@@ -261,7 +261,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
     ReceiverLanes, SphereView, _SphereAdjoint = lane_structs(lanes)
     fn = make_lane_functions(lanes)
     dot_direction, dot, total, add = fn.dot_direction, fn.dot, fn.total, fn.add
-    load, add_vectors, add_columns = fn.load, fn.add_vectors, fn.add_columns
+    is_positive, load, add_vectors, add_columns = fn.is_positive, fn.load, fn.add_vectors, fn.add_columns
     load_task, weight_functions = _make_load_task(lanes), make_weight_functions(lanes)
     find_weight_of_proxy, weight_adjoint = weight_functions.weight, weight_functions.adjoint
     SUMS = wp.constant(_SUMS)
@@ -303,8 +303,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
             mean = Vectors(task.sums[slot * SUMS], task.sums[slot * SUMS + 1], task.sums[slot * SUMS + 2])
             adj_cell = wp.cw_mul(inverse, dot(task.adj_light, mean))
             cosine = dot_direction(omega, receivers.normals)
-            is_facing = wp.min(wp.max(1.0e30 * cosine, Lane(0.0)), Lane(1.0))
-            adj_cosine = factor * wp.cw_mul(is_facing, wp.cw_mul(task.blocked[slot], adj_cell))
+            adj_cosine = factor * wp.cw_mul(is_positive(cosine), wp.cw_mul(task.blocked[slot], adj_cell))
             adj_normal.x += omega[0] * adj_cosine
             adj_normal.y += omega[1] * adj_cosine
             adj_normal.z += omega[2] * adj_cosine

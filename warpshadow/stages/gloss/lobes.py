@@ -153,11 +153,11 @@ class Lobes(NamedTuple):
 def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
     """Make the kernel and its adjoint, which take as many samples of a lobe at once as there are lanes."""
     Lane, Vectors, fn = lane_type(lanes), vectors_type(lanes), make_lane_functions(lanes)
-    sqrt, is_positive, dot, dot_direction = fn.sqrt, fn.is_positive, fn.dot, fn.dot_direction
+    sqrt, is_positive, dot, dot_direction, total = fn.sqrt, fn.is_positive, fn.dot, fn.dot_direction, fn.total
 
     @wp.func
-    def load(vectors: wp.array(dtype=wp.vec3), first: int):
-        """A block of vectors; zeros past the last."""
+    def load_or_zero(vectors: wp.array(dtype=wp.vec3), first: int):
+        """A block of vectors; zeros past the last, which sums over lanes count in."""
         x = Lane()
         y = Lane()
         z = Lane()
@@ -169,12 +169,8 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         return Vectors(x, y, z)
 
     @wp.func
-    def total(value: Lane):
-        return wp.dot(value, Lane(1.0))
-
-    @wp.func
     def total_vector(x: Lane, y: Lane, z: Lane):
-        return wp.vec3(wp.dot(x, Lane(1.0)), wp.dot(y, Lane(1.0)), wp.dot(z, Lane(1.0)))
+        return wp.vec3(total(x), total(y), total(z))
 
     @wp.func
     def find_cap(cap: wp.vec3, height_share: Lane, cosine: Lane, sine: Lane):
@@ -329,8 +325,8 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             grazing_square = wp.cw_mul(grazing_base, grazing_base)
             grazing_fourth = wp.cw_mul(grazing_square, grazing_square)
 
-            adj_direction = load(adj_directions[batch, receiver], block * lanes)
-            adj_filter = load(adj_filters[batch, receiver], block * lanes)
+            adj_direction = load_or_zero(adj_directions[batch, receiver], block * lanes)
+            adj_filter = load_or_zero(adj_filters[batch, receiver], block * lanes)
             adj_weight = adj_filter.x + wp.cw_mul(adj_filter.y, wp.cw_mul(grazing_fourth, grazing_base))
             adj_view_cosine = -5.0 * wp.cw_mul(wp.cw_mul(adj_filter.y, weight), grazing_fourth)
             adj_ratio = wp.cw_div(adj_weight, denominator)

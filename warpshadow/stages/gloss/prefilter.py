@@ -14,7 +14,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, expand_rows, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.lane_code import ANGLE
-from warpshadow.device.lanes import lane_count, lane_type, make_lane_functions, module_options, vectors_type
+from warpshadow.device.lanes import lane_count, lane_type, make_lane_functions, module_options
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
@@ -179,8 +179,8 @@ def _find_height(blur: float, texels_per_radian: float):
 @functools.cache
 def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
     """Make the kernel and its adjoint, which find the angles of as many samples at once as there are lanes."""
-    Lane, Vectors, fn = lane_type(lanes), vectors_type(lanes), make_lane_functions(lanes)
-    sqrt, is_positive = fn.sqrt, fn.is_positive
+    Lane, fn = lane_type(lanes), make_lane_functions(lanes)
+    sqrt, is_positive, load = fn.sqrt, fn.is_positive, fn.load
 
     @wp.func_native(f"""
     wp::vec_t<{lanes}, float> angles;
@@ -194,19 +194,6 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
     def find_angles(real: Lane, imaginary: Lane) -> Lane:  # type: ignore[empty-body, valid-type]
         """Angles of complex numbers, from −π to π."""
         ...
-
-    @wp.func
-    def load_samples(vectors: wp.array(dtype=wp.vec3), first: int):
-        """A block of vectors; the last again past it."""
-        x = Lane()
-        y = Lane()
-        z = Lane()
-        for lane in range(lanes):
-            vector = vectors[wp.min(first + lane, vectors.shape[0] - 1)]
-            x[lane] = vector[0]
-            y[lane] = vector[1]
-            z[lane] = vector[2]
-        return Vectors(x, y, z)
 
     @wp.func
     def find_place_angles(x: Lane, y: Lane, z: Lane):
@@ -233,7 +220,7 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         texels_per_radian = float(levels[0][1]) / wp.pi
         for block in range((light.shape[2] + lanes - 1) // lanes):
             first = block * lanes
-            sample_directions = load_samples(directions[batch, receiver], first)
+            sample_directions = load(directions[batch, receiver], block)
             half_turns, turns, _sine = find_place_angles(sample_directions.x, sample_directions.y, sample_directions.z)
             for lane in range(wp.min(lanes, light.shape[2] - first)):
                 height = _find_height(filters[batch, receiver, first + lane][2], texels_per_radian)
@@ -266,7 +253,7 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         texels_per_radian = float(levels[0][1]) / wp.pi
         for block in range((adj_light.shape[2] + lanes - 1) // lanes):
             first = block * lanes
-            sample_directions = load_samples(directions[batch, receiver], first)
+            sample_directions = load(directions[batch, receiver], block)
             half_turns, turns, sine = find_place_angles(sample_directions.x, sample_directions.y, sample_directions.z)
             adj_polar = Lane()
             adj_azimuth = Lane()

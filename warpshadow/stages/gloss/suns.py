@@ -16,8 +16,6 @@ known, the share F of a sphere:
 For Ω → 0 this is D of :mod:`.lobes`.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 import warp as wp
 
@@ -26,102 +24,15 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
-from warpshadow.maths import sh
 from warpshadow.maths.directions import cell_radius
+from warpshadow.maths.suns import Suns
 from warpshadow.stages.gloss.lobes import Lobes
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.gloss.transmittance import horizon_weight
 
-_MAX_SUNS = 8
-_BRIGHTNESS = 10.0  # radiance above which a pixel may be of a sun, in means of the map
-_MIN_SHARE = 0.003  # of all light, that a sun has at least
-_RADII = np.radians([6.0, 3.0, 1.5])  # of discs that are tried around the brightest spot, the widest first
-_MAX_SPREAD = 2.0  # size by the mean square of angles over the area that shines: 1 of discs, more of tubes and pairs
-_ISOLATION = 0.9  # of the bright light within twice that radius, that is within it: of wider spots it is less
-_RIM = 1.25  # where a disc has ended, in radii: as far as that nothing beside it is half as bright
-_MAX_AREA = 1.2  # size of a sun, in discs of that radius: a pixel of a coarse map is larger
-_MAX_TRIALS = 32  # brightest spots that are tried
-
 _COST = 20.0  # nanoseconds that a sun takes
 
 wp.set_module_options({"max_unroll": 1})
-
-
-class Suns(NamedTuple):
-    """Suns of a map, float64."""
-
-    directions: np.ndarray  # unit vectors towards their middles, [sun, 3]
-    irradiance: np.ndarray  # E of a surface that faces them, linear RGB, [sun, 3]
-    solid_angles: np.ndarray  # Ω [sr], [sun]
-
-
-class SeparatedLight(NamedTuple):
-    """A map that is separated from its suns."""
-
-    suns: Suns
-    without_suns: np.ndarray  # the map, in which their pixels are cut to ten times its mean radiance
-
-
-def separate_suns(radiance: np.ndarray) -> SeparatedLight:
-    """Separate suns from a map, at most 8: discs of up to 6° in radius that are much brighter than all on average.
-
-    Args:
-        radiance: Linear RGB, shape [height, 2·height, 3].
-    """
-    solid_angles = np.repeat(sh.pixel_solid_angles(len(radiance)), 2 * len(radiance))
-    brightness = radiance.mean(axis=2, dtype=np.float64).ravel()
-    total = brightness @ solid_angles
-    limit = _BRIGHTNESS * max(total, 0.0) / (4 * np.pi)
-    pixels = np.flatnonzero(brightness > limit)
-    directions = sh.equirectangular_directions(len(radiance)).reshape(-1, 3)[pixels]
-    shares = 1 - limit / brightness[pixels]
-    light = radiance.reshape(-1, 3)[pixels] * (shares * solid_angles[pixels])[:, None]
-    power = light.mean(axis=1)
-    is_candidate, is_sun = np.ones(len(pixels), bool), np.zeros(len(pixels), bool)
-    suns: list[tuple[np.ndarray, np.ndarray, float]] = []
-    for _ in range(_MAX_TRIALS):
-        if not is_candidate.any() or len(suns) == _MAX_SUNS:
-            break
-        brightest = np.argmax(np.where(is_candidate, brightness[pixels], -1))
-        from_brightest, is_in_disc = directions @ directions[brightest], np.zeros(len(pixels), bool)
-        for radius in _RADII:
-            is_close = is_candidate & (from_brightest > np.cos(2 * radius))
-            middle = power[is_close] @ directions[is_close]
-            cosines = directions @ (middle / np.linalg.norm(middle))
-            is_near = is_candidate & (cosines > np.cos(radius))
-            disc, wider_power = power[is_near], power[cosines > np.cos(2 * radius)].sum()
-            is_rim = (cosines <= np.cos(radius)) & (cosines > np.cos(_RIM * radius))
-            has_ended = brightness[pixels[is_rim]].max(initial=0) < brightness[pixels[brightest]] / 2
-            if has_ended and disc.sum() > max(_MIN_SHARE * total, _ISOLATION * wider_power):
-                mean = disc @ directions[is_near] / disc.sum()
-                length = np.linalg.norm(mean)
-                # of a disc the mean square of angles to its middle is Ω / (2π); pixels have a size, too
-                size = 4 * np.pi * (1 - length) + disc @ solid_angles[pixels[is_near]] / disc.sum()
-                area = disc.sum() ** 2 / (disc**2 / solid_angles[pixels[is_near]]).sum()
-                if size < min(_MAX_SPREAD * area, _MAX_AREA * 2 * np.pi * (1 - np.cos(radius))):
-                    suns.append((mean / length, light[is_near].sum(axis=0), size))
-                    is_in_disc = is_near
-                    break
-        is_sun |= is_in_disc
-        is_candidate &= ~(is_in_disc if is_in_disc.any() else from_brightest > np.cos(2 * _RADII[0]))
-    without_suns = radiance.reshape(-1, 3).copy()
-    without_suns[pixels[is_sun]] *= (1 - shares[is_sun])[:, None]
-    columns = np.array([[*direction, *irradiance, size] for direction, irradiance, size in suns]).reshape(-1, 7)
-    suns_of_map = Suns(columns[:, :3], columns[:, 3:6], columns[:, 6])
-    return SeparatedLight(suns_of_map, without_suns.reshape(radiance.shape))
-
-
-def directions_in_suns(suns: Suns, count: int) -> np.ndarray:
-    """Directions that are even over each sun; unit vectors, [sun, direction, 3]."""
-    i = np.arange(count)
-    x, y = np.sqrt((i + 0.5) / count) * [np.cos(np.pi * (1 + np.sqrt(5)) * i), np.sin(np.pi * (1 + np.sqrt(5)) * i)]
-    axes = np.eye(3)[np.abs(suns.directions).argmin(axis=1)]
-    tangents = np.cross(suns.directions, axes)
-    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    bitangents = np.cross(suns.directions, tangents)
-    offsets = x[:, None] * tangents[:, None] + y[:, None] * bitangents[:, None] if count > 1 else np.zeros((1, 3))
-    directions = suns.directions[:, None] + np.sqrt(suns.solid_angles / np.pi)[:, None, None] * offsets
-    return directions / np.linalg.norm(directions, axis=2, keepdims=True)
 
 
 @wp.kernel

@@ -12,7 +12,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, expand_rows
 from warpshadow.device.constants import constant
-from warpshadow.device.lanes import Chunk, as_chunks, total_of_chunk, use_vector_registers
+from warpshadow.device.lanes import Chunk, as_chunks, is_positive_in_chunk, total_of_chunk, use_vector_registers
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_slot, split_row
@@ -167,7 +167,7 @@ def _interpolate_cells_adjoint(
         x = cells[0, chunk]
         y = cells[1, chunk]
         z = cells[2, chunk]
-        is_blocked = wp.min(wp.max(1.0e30 * (above[chunk] - through[chunk]), Chunk(0.0)), Chunk(1.0))
+        is_blocked = is_positive_in_chunk(above[chunk] - through[chunk])
         adj_blocked = wp.cw_mul(is_blocked, adj_through_cells[chunk])
         if adj_transmittance:
             adj_transmittance[batch, receiver, chunk] = adj_transmittance[batch, receiver, chunk] + adj_blocked

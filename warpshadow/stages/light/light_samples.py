@@ -15,8 +15,8 @@ SET_COUNT = 16
 
 _UNIFORM_SHARE = 0.1  # of the samples of a map: light too dim to be drawn still is
 
-_SUN_BRIGHTNESS = 30.0  # radiance, in means of the map, from which shared directions are aimed at a pixel …
-_SUN_SHARE = 0.35  # … and such pixels get so much of them at most
+_BRIGHTNESS = 30.0  # radiance, in means of the map, from which shared directions are aimed at a pixel …
+_BRIGHT_SHARE = 0.35  # … and such pixels get so much of them at most
 _UNSEEN_SHARE = 0.3  # of the importance of light, which stays where receivers do not see it
 _MIN_ROWS, _MAX_ROWS = 64, 512  # of a map that is cut
 
@@ -88,15 +88,16 @@ def cut_map(
     that see all of the rectangle get exactly its light, for any normal. Receivers on whose horizon it lies see a part
     of it and get too little; therefore the first cut is along the horizon of level ground.
 
-    Importance is luminance, to which even light adds a tenth. Suns, pixels :data:`_SUN_BRIGHTNESS` times as bright as
-    the mean, have :data:`_SUN_SHARE` of it at most: their many directions would be close to each other.
+    Importance is luminance, to which even light adds a tenth. Bright pixels, with
+    :data:`_BRIGHTNESS` means of the map, such as those of a sun or a window, have :data:`_BRIGHT_SHARE` of it at most:
+    their many directions would be close to each other.
 
     Args:
         radiance: Linear RGB, shape [height, 2·height, 3]; negative lobes of a band-limited map are welcome.
         count: Number of directions, a multiple of 16; runs of 16 and of 4 are close to each other.
         find_shares: Finds, given directions, the share of receivers' light that comes from each, shape [direction].
-            Where given, importance, but for suns', goes to directions that receivers see, in a second cut: to a room's
-            window.
+            Where given, importance, but for bright pixels', goes to directions that receivers see, in a second cut: to
+            a room's window.
     """
     radiance = _resize_map(np.asarray(radiance, np.float64))
     height, width, _ = radiance.shape
@@ -105,11 +106,11 @@ def cut_map(
     power = brightness * solid_angle
     importance = _UNIFORM_SHARE * solid_angle / (4 * np.pi)
     total_power = power.sum()
-    is_sun = brightness > _SUN_BRIGHTNESS * total_power / (4 * np.pi)
+    is_bright = brightness > _BRIGHTNESS * total_power / (4 * np.pi)
     if brightness.any():
         power /= total_power
-        sun_share = power[is_sun].sum()
-        power[is_sun] *= min(_SUN_SHARE / max(sun_share, _SUN_SHARE), 1.0)
+        bright_share = power[is_bright].sum()
+        power[is_bright] *= min(_BRIGHT_SHARE / max(bright_share, _BRIGHT_SHARE), 1.0)
         importance += (1 - _UNIFORM_SHARE) * power / power.sum()
 
     def cut_halves(importance: np.ndarray) -> np.ndarray:
@@ -126,10 +127,10 @@ def cut_map(
     if find_shares is not None:
         visible_importance = importance.copy()
         pixels = cuts.round().astype(int).reshape(-1, 4).tolist()
-        for (top, bottom, left, right), sun_share in zip(pixels, find_shares(samples), strict=True):
-            visible_importance[top:bottom, left:right] *= _UNSEEN_SHARE + (1 - _UNSEEN_SHARE) * count * sun_share
-        visible_importance *= importance[~is_sun].sum() / max(visible_importance[~is_sun].sum(), 1e-300)
-        samples = _mean_samples(radiance, solid_angle, cut_halves(np.where(is_sun, importance, visible_importance)))
+        for (top, bottom, left, right), share in zip(pixels, find_shares(samples), strict=True):
+            visible_importance[top:bottom, left:right] *= _UNSEEN_SHARE + (1 - _UNSEEN_SHARE) * count * share
+        visible_importance *= importance[~is_bright].sum() / max(visible_importance[~is_bright].sum(), 1e-300)
+        samples = _mean_samples(radiance, solid_angle, cut_halves(np.where(is_bright, importance, visible_importance)))
     permutation = compact_order(samples.directions[0], runs=(CHUNK, BUNDLE))
     return LightSamples(samples.directions[:, permutation], samples.radiance[:, permutation])
 

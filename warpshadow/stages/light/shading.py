@@ -10,7 +10,7 @@ from warpshadow import check
 from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.device.lanes import Chunk, as_chunks, use_vector_registers
+from warpshadow.device.lanes import Chunk, as_chunks, total_of_chunk, use_vector_registers
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
@@ -49,14 +49,6 @@ def _join_channels(
     light[batch, k] = light[batch, k] + wp.vec3(channels[batch, 0, k], channels[batch, 1, k], channels[batch, 2, k])
 
 
-@wp.func
-def _sum_chunk(values: Chunk):
-    total = float(0.0)
-    for i in range(CHUNK):
-        total += values[i]
-    return total
-
-
 @wp.kernel(enable_backward=False)
 def _shade(
     first_row: int,
@@ -81,7 +73,7 @@ def _shade(
         red += wp.cw_mul(t, light_chunks[light_batch, 0, chunk])
         green += wp.cw_mul(t, light_chunks[light_batch, 1, chunk])
         blue += wp.cw_mul(t, light_chunks[light_batch, 2, chunk])
-    irradiance = wp.vec3(_sum_chunk(red), _sum_chunk(green), _sum_chunk(blue))
+    irradiance = wp.vec3(total_of_chunk(red), total_of_chunk(green), total_of_chunk(blue))
     for k in range(CHUNK * transfer_chunks.shape[2], transfer.shape[2]):
         irradiance += transfer[transfer_batch, receiver, k] * wp.vec3(
             light[light_batch, 0, k], light[light_batch, 1, k], light[light_batch, 2, k]
@@ -274,7 +266,7 @@ def _shade_cells(
         red += _light_of_chunk(transfer, light[light_batch, 0, chunk])
         green += _light_of_chunk(transfer, light[light_batch, 1, chunk])
         blue += _light_of_chunk(transfer, light[light_batch, 2, chunk])
-    shading[batch, receiver] = weight * wp.vec3(_sum_chunk(red), _sum_chunk(green), _sum_chunk(blue))
+    shading[batch, receiver] = weight * wp.vec3(total_of_chunk(red), total_of_chunk(green), total_of_chunk(blue))
 
 
 def shade_cells(

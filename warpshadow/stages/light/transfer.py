@@ -17,6 +17,7 @@ from warpshadow.device.lanes import (
     Chunk,
     as_chunks,
     block_count,
+    is_positive_in_chunk,
     lane_count,
     lane_type,
     make_lane_functions,
@@ -44,12 +45,25 @@ wp.set_module_options({"max_unroll": 1})
 
 
 @functools.cache
-def _make_sh_transfer(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
+def _make_sh_transfer(order: int, is_shadowed: bool, lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
+    """Make the kernel and its adjoint."""
     Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
     fn = make_lane_functions(lanes)
-    find_block, dot, load, load_rows, store_rows = fn.find_block, fn.dot, fn.load, fn.load_rows, fn.store_rows
+    find_block, dot, is_positive, load, add_vectors = fn.find_block, fn.dot, fn.is_positive, fn.load, fn.add_vectors
+    load_rows, store_rows, add_rows = fn.load_rows, fn.store_rows, fn.add_rows
     add_rotated_zonal, multiply = make_add_rotated_zonal(order, lanes), make_multiply(order, lanes)
+    rotated_zonal_adjoint = make_rotated_zonal_adjoint(order, lanes)
     COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
+
+    @wp.func
+    def load_cosines(normals: wp.array(dtype=wp.vec3), block: int):
+        """A block's normals and the zonal coefficients of their clamped cosines, 0 around a zero normal."""
+        normal = load(normals, block)
+        is_there = is_positive(dot(normal, normal))
+        zonal = Zonal()
+        for band in range(order):
+            zonal[band] = COSINE[band] * is_there
+        return normal, zonal
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def transfer_sh(
@@ -71,12 +85,7 @@ def _make_sh_transfer(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
         cosine = scratch[slot, 0]
         for i in range(wp.static(order**2)):
             cosine[i] = Lane(0.0)
-        normal = load(normals[batch], block)
-        # there is no cosine around a zero normal
-        is_there = wp.min(dot(normal, normal) * 1.0e30, Lane(1.0))
-        zonal = Zonal()
-        for band in range(order):
-            zonal[band] = COSINE[band] * is_there
+        normal, zonal = load_cosines(normals[batch], block)
         add_rotated_zonal(normal, zonal, cosine)
         if wp.static(is_shadowed):
             factor = scratch[slot, 1]
@@ -86,19 +95,6 @@ def _make_sh_transfer(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
             store_rows(product, block, transfer[batch])
         else:
             store_rows(cosine, block, transfer[batch])
-
-    return transfer_sh
-
-
-@functools.cache
-def _make_sh_transfer_adjoint(order: int, is_shadowed: bool, lanes: int) -> wp.Kernel:
-    Lane, Zonal = lane_type(lanes), zonal_type(order, lanes)
-    fn = make_lane_functions(lanes)
-    find_block, dot, load, load_rows = fn.find_block, fn.dot, fn.load, fn.load_rows
-    add_rows, add_vectors = fn.add_rows, fn.add_vectors
-    add_rotated_zonal, multiply = make_add_rotated_zonal(order, lanes), make_multiply(order, lanes)
-    rotated_zonal_adjoint = make_rotated_zonal_adjoint(order, lanes)
-    COSINE = wp.types.vector(length=order, dtype=wp.float32)(*(sh.clamped_cosine(order) / np.pi))
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def transfer_sh_adjoint(
@@ -122,11 +118,7 @@ def _make_sh_transfer_adjoint(order: int, is_shadowed: bool, lanes: int) -> wp.K
         adj_row = scratch[slot, 0]
         factor = scratch[slot, 1]
         product = scratch[slot, 2]
-        normal = load(normals[batch], block)
-        is_there = wp.min(dot(normal, normal) * 1.0e30, Lane(1.0))
-        zonal = Zonal()
-        for band in range(order):
-            zonal[band] = COSINE[band] * is_there
+        normal, zonal = load_cosines(normals[batch], block)
         for i in range(adj_transfer.shape[2], wp.static(order**2)):
             adj_row[i] = Lane(0.0)
         load_rows(adj_transfer[batch], block, adj_row)
@@ -145,7 +137,7 @@ def _make_sh_transfer_adjoint(order: int, is_shadowed: bool, lanes: int) -> wp.K
             adj_normal, _adj_zonal = rotated_zonal_adjoint(normal, zonal, adj_row)
             add_vectors(adj_normal, block, adj_normals[batch])
 
-    return transfer_sh_adjoint
+    return transfer_sh, transfer_sh_adjoint
 
 
 def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, bands: int | None = None) -> wp.array:
@@ -174,11 +166,11 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
     variables = [visibility, normals]
     scratch = [Scratch((3, order**2), lane_type(lanes))]
     cost = PRODUCT_COST * lanes * order**2 * bands**2
-    is_shadowed = visibility is not None
+    transfer_kernel, adjoint_kernel = _make_sh_transfer(order, visibility is not None, lanes)
     lit_bands = tuple(band for band in range(order) if band < 2 or band % 2 == 0)  # of a clamped cosine
     return differentiable(
         lambda transfer: launch(
-            _make_sh_transfer(order, is_shadowed, lanes),
+            transfer_kernel,
             row_count,
             inputs=[*variables, product_table(order, str(device), lit_bands, bands)],
             scratch=scratch,
@@ -186,7 +178,7 @@ def sh_transfer(visibility: wp.array | None, normals: wp.array, *, order: int, b
             cost=cost,
         ),
         lambda adj_transfer: launch(
-            _make_sh_transfer_adjoint(order, is_shadowed, lanes),
+            adjoint_kernel,
             row_count,
             inputs=[*variables, product_table(order, str(device), tuple(range(bands))), adj_transfer],
             scratch=scratch,
@@ -300,7 +292,7 @@ def transfer_chunk_adjoint(
     cosine = wp.cw_mul(nx, x) + wp.cw_mul(ny, y) + wp.cw_mul(nz, z)
     weighted = weight * adj
     wp.adjoint[transmittance] += wp.cw_mul(weighted, wp.max(cosine, Chunk(0.0)))
-    is_up = wp.min(wp.max(cosine * 1.0e30, Chunk(0.0)), Chunk(1.0))
+    is_up = is_positive_in_chunk(cosine)
     adj_cosine = wp.cw_mul(wp.cw_mul(weighted, transmittance), is_up)
     wp.adjoint[nx] += wp.cw_mul(adj_cosine, x)
     wp.adjoint[ny] += wp.cw_mul(adj_cosine, y)

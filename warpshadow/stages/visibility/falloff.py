@@ -162,7 +162,8 @@ def make_cap_adjoint(
     Lane, Vectors, Cap = lane_type(lanes), vectors_type(lanes), cap_type(lanes)
     ReceiverLanes, SphereView, SphereAdjoint = lane_structs(lanes)
     fn = make_lane_functions(lanes)
-    sqrt, is_any_above, scale, add = fn.sqrt, fn.is_any_above, fn.scale, fn.add
+    sqrt, is_any_above, is_positive = fn.sqrt, fn.is_any_above, fn.is_positive
+    scale, add = fn.scale, fn.add
     falloff, sphere_adjoint = make_falloff(lanes), make_sphere_adjoint(lanes)
     cap_functions = make_cap_functions(has_horizon, lanes, has_footprints)
     widen_cone, spread, reaches_bundle, is_above_horizon, soft_edge = cap_functions
@@ -249,7 +250,7 @@ def make_cap_adjoint(
                         spread(squared_distance, receivers),
                         wp.max(squared_distance + (2.0 * FOOTPRINT_SHARE) * receivers.footprints, Lane(1.0e-37)),
                     )
-                    is_outside = wp.min(wp.max(1.0e30 * squared_distance, Lane(0.0)), Lane(1.0))
+                    is_outside = is_positive(squared_distance)
                     adj_squared_distance = -wp.cw_mul(is_outside, wp.cw_mul(adj_spread, distance_slope))
                     adj_offset = add(adj_offset, scale(2.0 * adj_squared_distance, sphere_view.offset))
                     adj_radius -= (2.0 / sphere_view.curvature) * adj_squared_distance
