@@ -100,11 +100,11 @@ class LightTransport:
 
     def bounce_solver(self, points: ShadingContext, light: LightInput, materials: Materials) -> BounceSolver:
         """How light bounces onto points."""
-        shell_moves = light.shell is not None and light.shell.requires_grad
+        varies = light.shell is not None and (light.shell.requires_grad or light.is_free and light.shell_count > 1)
         return choose_bounce_solver(
             is_free=light.is_free,
             is_given=materials is not points.materials,
-            is_of_scene=points.is_scene_view and not shell_moves,
+            is_of_scene=points.is_scene_view and not varies,
             has_spheres=self.method.visibility.traits.has_spheres,
             shares_directions=self.method.shares_directions,
         )
@@ -128,6 +128,11 @@ class LightTransport:
         static = self._static_bounces
         if not light.is_free:
             return static.add_bounces(direct, self._lit_patch_samples(points, light, materials), points, materials)
+        if light.shell_count > 1:
+            raise ValueError(
+                f"shell: got {light.shell_count} for free light that bounces along rays, expected one, or the method "
+                "'directional'"
+            )
         samples = static.patch_samples(points, materials)
         if materials.emission:
             emitted = self.method.light_of_emitters(samples, materials)

@@ -151,6 +151,28 @@ def test_a_batch_of_shells_is_one_after_another(gloss, bounces):
     assert (together[1] - together[0]).abs().max() > 0.01
 
 
+SHELLS = torch.tensor([[*CENTER, 2.2], [0.1, 0.6, 0, 3.5]])
+
+
+def test_rays_find_an_image_for_each_shell_of_a_batch():
+    renderer = TorchRenderer(scene_of(method="ray-traced", size=16), basis=ws.HarmonicBasis(3))
+    for light in (None, torch.rand(9, 3, generator=torch.Generator().manual_seed(0))):
+        single = torch.stack([renderer(light, shell=shell) for shell in SHELLS])
+        torch.testing.assert_close(renderer(light, shell=SHELLS), single, rtol=1e-5, atol=1e-6)
+        assert (single[1] - single[0]).abs().max() > 0.01
+
+
+def test_free_light_bounces_from_each_shell_of_a_batch():
+    renderer = TorchRenderer(scene_of(bounces=1, size=16))
+    light = torch.as_tensor(renderer.basis.coefficients(renderer.scene.light), dtype=torch.float32)
+    single = torch.stack([renderer(light, shell=shell) for shell in SHELLS])
+    off = (renderer(light, shell=SHELLS) - single).abs().max()
+    assert off < 0.1 * (single[1] - single[0]).abs().max()  # bounces of one shell and of several are found in two ways
+    traced = TorchRenderer(scene_of(bounces=1, size=16, method="ray-traced"), basis=renderer.basis)
+    with pytest.raises(ValueError, match="shell: got 2 for free light that bounces along rays"):
+        traced(light, shell=SHELLS)
+
+
 def test_a_light_of_another_radius_is_not_the_last_one(renderer):
     before = renderer(ws.EnvironmentMap(windows(), radius=2.2, center=CENTER))
     other = renderer(ws.EnvironmentMap(windows(), radius=3.0, center=CENTER))

@@ -170,7 +170,7 @@ class RayTraced(Method):
     ) -> wp.array:
         points, shells = _checked_points(receivers.points), _shells(receivers, shell)
         samples = sample_map(light.radiance, self._sample_count)
-        traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
+        traced = wp.empty(_batch_shape(points, shells), dtype=wp.vec3, device=points.device)
         batches = traced, meshes, points, receivers.normals, shells
         for result, mesh, origins, normals, instance_shell in _instances(*batches):
             wp.copy(
@@ -184,7 +184,7 @@ class RayTraced(Method):
         """Shading by rays in directions that all receivers share, or to points of a shell."""
         points, shells = _checked_points(receivers.points), _shells(receivers, shell)
         count = -(-self.visibility.ray_count // PACKET) * PACKET
-        traced = wp.empty(points.shape, dtype=wp.vec3, device=points.device)
+        traced = wp.empty(_batch_shape(points, shells), dtype=wp.vec3, device=points.device)
         batches = traced, trees, points, receivers.normals, shells
         for instance, (result, tree, origins, normals, instance_shell) in enumerate(_instances(*batches)):
             arguments, options = (tree, origins, normals), {"shell": instance_shell}
@@ -201,7 +201,8 @@ class RayTraced(Method):
 
     def _transfer(self, meshes: Meshes, receivers: Receivers, shell: wp.array | None = None) -> list[wp.array]:
         points, shells = receivers.points, _shells(receivers, shell)
-        transfer = wp.empty((*points.shape, self.basis.size), dtype=wp.float32, device=points.device)
+        shape = *_batch_shape(points, shells), self.basis.size
+        transfer = wp.empty(shape, dtype=wp.float32, device=points.device)
         functions, count = self.basis.functions, self.visibility.ray_count
         if isinstance(self.basis, CellBasis):
             functions, count = self.basis.balanced_functions, max(count, _RAYS_OF_CELL * self.basis.size)
@@ -271,6 +272,11 @@ def _checked_points(points: wp.array) -> wp.array:
             "another method"
         )
     return points
+
+
+def _batch_shape(points: wp.array, shells: np.ndarray) -> tuple[int, int]:
+    """Shape of results [batch, receiver] of points and shells, each of which may be one for all."""
+    return max(len(points), len(shells)) if points.size else 0, points.shape[1]
 
 
 def _shells(receivers: Receivers, shell: wp.array | None) -> np.ndarray:

@@ -26,6 +26,11 @@ class LightInput(Input):
         return isinstance(self.value(), wp.array)
 
     @property
+    def shell_count(self) -> int:
+        """Number of given shells, one or one for each image; 0 for that of the scene, or none."""
+        return 0 if self.shell is None else len(self.shell.value())
+
+    @property
     def visibility_key(self) -> Input | None:
         """The input on which visibility depends besides points and blockers.
 
