@@ -784,13 +784,13 @@ def test_gradients_of_sums_of_lobes_are_exact(quantity, double, device, check):
 
 @pytest.mark.parametrize("quantity", ["radiance", "filters"])
 def test_gradients_of_the_light_of_metals_are_exact(quantity, double, device, check):
-    """Of samples that meet a face whose mirrored ray is open, or blocked, or no face."""
+    """Of samples that meet a face, whose mirrored ray meets the sky, a body, or leaves below it, and that meet none."""
     module = double("stages.gloss.mirrored")
     hits = np.int32([[[0, 0, -1], [1, -1, 1]]]), np.abs(random(0, 1, 2, 3, 3)), unit(random(1, 1, 2, 3, 3))
-    dtypes = wp.int32, wp.vec3d, wp.vec3d, wp.float64, wp.vec3d
-    is_open, points = np.float64([[[1, 0, 0], [1, 0, 0]]]), np.zeros((1, 2, 3, 3))
+    dtypes = wp.int32, wp.vec3d, wp.vec3d, wp.int32, wp.vec3d
+    last_rays, points = np.int32([[[0, 1, 1], [2, 2, 0]]]), np.zeros((1, 2, 3, 3))
     hits = double("stages.gloss.lobe_hits").LobeHits(
-        *(put(values, dtype, device) for values, dtype in zip((*hits, is_open, points), dtypes, strict=True))
+        *(put(values, dtype, device) for values, dtype in zip((*hits, last_rays, points), dtypes, strict=True))
     )
     faces = put(np.int32([[0, 1, 2], [1, 3, 2]]), wp.vec3i, device)
 

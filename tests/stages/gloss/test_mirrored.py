@@ -26,9 +26,9 @@ def put(values, dtype, device):
     return wp.array(np.asarray(values), dtype=dtype, device=device)
 
 
-def hits_of(device, transmittance=0.0):
+def hits_of(device, transmittance=0.0, points=POINTS, normals=UP, directions=DIRECTIONS):
     mesh = wp.Mesh(put(POSITIONS, wp.vec3, device), put(FACES.ravel(), wp.int32, device))
-    arrays = [put(values, wp.vec3, device) for values in (NORMALS, POINTS, UP, DIRECTIONS)]
+    arrays = [put(values, wp.vec3, device) for values in (NORMALS, points, normals, directions)]
     through = wp.full((2, 3), transmittance, dtype=wp.float32, device=device)
     is_mirror, faces = put([1, 1, 0, 0], wp.int32, device), put(FACES, wp.vec3i, device)
     return lobe_hits.trace_hits(mesh, is_mirror, faces, *arrays, through), faces
@@ -55,7 +55,8 @@ def test_samples_meet_the_mirror_alone_and_see_what_its_normals_mirror(device):
     np.testing.assert_array_equal(hits.face_ids.numpy() >= 0, meets)
     assert meets.sum() == 3 and set(is_open[meets]) == {True, False}
     np.testing.assert_allclose(hits.normals.numpy()[meets], normals[meets], atol=FLOAT32)
-    np.testing.assert_array_equal(hits.is_open.numpy()[meets], is_open[meets])
+    np.testing.assert_array_equal(hits.last_rays.numpy()[meets] == lobe_hits.MEETS_SKY, is_open[meets])
+    assert (hits.last_rays.numpy() != lobe_hits.LEAVES_BELOW).all()
     expected = np.where(meets[..., None], places, POINTS[:, None])
     np.testing.assert_allclose(hits.points.numpy(), expected, atol=FLOAT32)
 
@@ -111,3 +112,21 @@ def test_metals_send_the_light_that_they_mirror_in_their_color(device):
     expected = np.zeros((2, 3, 3))
     expected[meets] = ((1 - through[meets]) * share)[:, None] * (fresnel * seen - of_receivers[meets])
     np.testing.assert_allclose(radiance.numpy()[0], expected, atol=10 * FLOAT32)
+
+
+def test_no_light_comes_from_below_the_face_that_a_ray_leaves(device):
+    points = np.array([[0.98, -0.5, 0], [1, 0.05, 0.02]], np.float32)  # before the mirror, and on it
+    towards_mirror = [[0.3, 1, 0], [0.05, 1, 0], [1, 0.1, 0]]  # below it once mirrored; behind its normal; straight on
+    directions = twins.unit(np.array([towards_mirror, [[0.05, 1, 0.3], [-0.5, 1, 0], [-1, 0, 0]]], float))
+    normals = twins.unit(np.array([[0.0, 1, 0], [-1, 0.2, 0.1]]))
+    hits, faces = hits_of(device, 0.0, points, normals, directions)
+    is_below = np.array([[True, True, False], [True, False, False]])
+    np.testing.assert_array_equal(hits.last_rays.numpy() == lobe_hits.LEAVES_BELOW, is_below)
+    np.testing.assert_array_equal(hits.face_ids.numpy()[is_below] >= 0, [True, True, False])
+    arrays = inputs_of(device)
+    metallic, mean, through = (array.numpy()[0] for array in arrays[4:])
+    radiance = mixed(device, batched(hits), faces, *arrays)[0].numpy()[0]
+    weights, corners = hits.barycentrics.numpy()[0, :2], FACES[hits.face_ids.numpy()[0, :2]]
+    shares = np.append((weights * metallic[corners]).sum(axis=1), 1.0)
+    expected = -((1 - through[is_below]) * shares)[:, None] * mean[[0, 0, 1]]
+    np.testing.assert_allclose(radiance[is_below], expected, atol=10 * FLOAT32)

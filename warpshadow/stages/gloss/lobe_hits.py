@@ -1,4 +1,7 @@
-"""Hits of lobes: which faces of bodies that shine their samples meet, and whether these see the sky they mirror."""
+"""Hits of lobes: which faces of bodies that shine their samples meet, and whether these see the sky they mirror.
+
+Where smooth normals lean away from faces, rays leave below the face that they start on. There is no light from there.
+"""
 
 from typing import NamedTuple
 
@@ -8,6 +11,8 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.rays.ray_tracing import RAY_COST, escapes, first_hit
+
+MEETS_SKY, MEETS_BODY, LEAVES_BELOW = (wp.constant(number) for number in range(3))  # what becomes of a ray
 
 wp.set_module_options({"max_unroll": 1})
 
@@ -29,7 +34,7 @@ def _trace_hits(
     face_ids: wp.array2d(dtype=wp.int32),
     barycentrics: wp.array2d(dtype=wp.vec3),
     hit_normals: wp.array2d(dtype=wp.vec3),
-    is_open: wp.array2d(dtype=wp.float32),
+    last_rays: wp.array2d(dtype=wp.int32),
     hit_points: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a sample."""
@@ -38,9 +43,12 @@ def _trace_hits(
     direction = directions[receiver, sample]
     face = int(-1)
     point = points[receiver]
+    last_ray = int(MEETS_BODY)
     if transmittance[receiver, sample] < 1.0 and wp.dot(direction, normals[receiver]) > 0.0:
         hit = first_hit(mesh, points[receiver], normals[receiver], direction)
         face = hit.face
+        if hit.is_below:
+            last_ray = LEAVES_BELOW
         if is_mirror[wp.max(face, 0)] == 0:
             face = -1
         if face >= 0:
@@ -57,9 +65,12 @@ def _trace_hits(
             mirrored = direction - 2.0 * cosine * normal
             barycentrics[receiver, sample] = hit.weights
             hit_normals[receiver, sample] = normal
-            is_open[receiver, sample] = 0.0
-            if cosine < 0.0 and escapes(mesh, point, normal, mirrored):
-                is_open[receiver, sample] = 1.0
+            rise = wp.dot(wp.mesh_eval_face_normal(mesh, face), mirrored)
+            if cosine >= 0.0 or rise * wp.where(hit.is_back, -1.0, 1.0) <= 0.0:
+                last_ray = LEAVES_BELOW
+            elif escapes(mesh, point, normal, mirrored):
+                last_ray = MEETS_SKY
+    last_rays[receiver, sample] = last_ray
     face_ids[receiver, sample] = face
     hit_points[receiver, sample] = point
 
@@ -70,11 +81,11 @@ class LobeHits(NamedTuple):
     face_ids: wp.array  # int32, −1 for a sample that meets no such body: it has no other number
     barycentrics: wp.array  # vec3
     normals: wp.array  # unit normals on the side that is met, vec3
-    is_open: wp.array  # T', float32
+    last_rays: wp.array  # what becomes of the ray that is mirrored, else of the sample: MEETS_SKY or another; int32
     points: wp.array  # vec3 [scene units]; the receiver of a sample that meets no such body
 
 
-HIT_TYPES = wp.int32, wp.vec3, wp.vec3, wp.float32, wp.vec3  # of the arrays of LobeHits
+HIT_TYPES = wp.int32, wp.vec3, wp.vec3, wp.int32, wp.vec3  # of the arrays of LobeHits
 
 
 def trace_hits(

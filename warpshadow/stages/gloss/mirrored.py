@@ -3,10 +3,12 @@
 A sample l of a lobe, of transmittance T, meets a body at a point with normal n, which mirrors l' = l − 2 (n·l) n. To
 the mean radiance R̄ of the receiver's blockers the point adds
 
-    M = (1 − T) m (F (T' L + (1 − T') R̄) − R̄),   F = a + (1 − a) (1 − |n·l|)⁵,
+    M = (1 − T) m (F L' − R̄),   F = a + (1 − a) (1 − |n·l|)⁵,
 
-m how metallic it is, a its albedo, T' whether a ray along l' meets no body, and L light without shadows from l',
-blurred by σ'² = σ² + 2 α²: σ is the blur of the sample (:mod:`.lobes`), √2 α that of a whole lobe, seen from above.
+m how metallic it is, a its albedo, and L' the radiance from l': R̄ where that ray meets a body, 0 where it leaves below
+the face that it starts on (:mod:`.lobe_hits`), else L, light without shadows, blurred by σ'² = σ² + 2 α²: σ is the blur
+of the sample (:mod:`.lobes`), √2 α that of a whole lobe, seen from above. Where l itself leaves below the receiver's
+face, M = −(1 − T) R̄.
 """
 
 from typing import NamedTuple
@@ -16,7 +18,7 @@ import warp as wp
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
-from warpshadow.stages.gloss.lobe_hits import LobeHits
+from warpshadow.stages.gloss.lobe_hits import LEAVES_BELOW, MEETS_SKY, LobeHits
 from warpshadow.stages.gloss.lobes import MIN_ROUGHNESS
 from warpshadow.stages.raster.interpolation import interpolate_at
 
@@ -106,7 +108,7 @@ def _mix_mirrored(
     # in
     face_ids: wp.array3d(dtype=wp.int32),
     barycentrics: wp.array3d(dtype=wp.vec3),
-    is_open: wp.array3d(dtype=wp.float32),
+    last_rays: wp.array3d(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     albedo: wp.array2d(dtype=wp.vec3),
     metallic: wp.array2d(dtype=wp.float32),
@@ -122,19 +124,24 @@ def _mix_mirrored(
     batch, receiver = split_row(first_row + row, radiance.shape[1])
     hit_batch = instance_in(batch, face_ids.shape[0])
     face = face_ids[hit_batch, receiver, sample]
+    last_ray = last_rays[hit_batch, receiver, sample]
+    blocked = 1.0 - transmittance[instance_in(batch, transmittance.shape[0]), receiver, sample]
+    mean = mean_radiance[instance_in(batch, mean_radiance.shape[0]), receiver]
     result = wp.vec3(0.0)
+    if face < 0 and last_ray == LEAVES_BELOW:
+        result = -blocked * mean
     if face >= 0:
         weights = barycentrics[hit_batch, receiver, sample]
         color = interpolate_at(albedo[instance_in(batch, albedo.shape[0])], faces[face], weights)
         share = interpolate_at(metallic[instance_in(batch, metallic.shape[0])], faces[face], weights)
-        share *= 1.0 - transmittance[instance_in(batch, transmittance.shape[0]), receiver, sample]
-        mean = mean_radiance[instance_in(batch, mean_radiance.shape[0]), receiver]
         grazing = filters[instance_in(batch, filters.shape[0]), receiver, sample][0]
         seen = mean
-        if is_open[hit_batch, receiver, sample] > 0.5:
+        if last_ray == MEETS_SKY:
             seen = light[instance_in(batch, light.shape[0]), receiver, sample]
+        if last_ray == LEAVES_BELOW:
+            seen = wp.vec3()
         fresnel = color + grazing * (wp.vec3(1.0) - color)
-        result = share * (wp.cw_mul(fresnel, seen) - mean)
+        result = share * blocked * (wp.cw_mul(fresnel, seen) - mean)
     radiance[batch, receiver, sample] = result
 
 
@@ -171,7 +178,7 @@ def mix_mirrored(
     launch(
         _mix_mirrored,
         (shape[0] * shape[1], shape[2]),
-        inputs=[hits.face_ids, hits.barycentrics, hits.is_open, faces, *values.values()],
+        inputs=[hits.face_ids, hits.barycentrics, hits.last_rays, faces, *values.values()],
         outputs=[radiance],
         shared=[
             albedo,

@@ -135,6 +135,7 @@ class RayHit:
     face: int  # number of the face, -1 for none
     weights: wp.vec3  # barycentrics on it
     is_back: bool  # whether it is met from behind
+    is_below: bool  # whether there is none since the ray leaves below the face that its receiver lies on
 
 
 @wp.func
@@ -159,6 +160,7 @@ def first_hit(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, ray_direction: w
                 hit.face = wp.where(is_on_face, -1, face)
                 hit.weights = wp.vec3(volumes / (volumes[0] + volumes[1] + volumes[2]))
                 hit.is_back = slope > wp.float64(0.0)
+                hit.is_below = is_on_face
     return hit
 
 
