@@ -45,7 +45,7 @@ class ProjectedLight(Protocol):
 
 
 class SphereMethod(Method, Generic[Projected, FoundVisibility]):
-    """A method in which spheres stand in for the bodies: visibility, transfer vectors, and shading.
+    """A method in which spheres, or planes and convex parts, stand in for bodies: visibility, transfer vectors, and shading.
 
     Its two types are those of light and of visibility in its basis. A method gives these members, besides those of
     :class:`.Method` for bodies that shine:
@@ -308,7 +308,7 @@ class VisibilityNode(Node):
         self._planes = ExplainRow(
             f"planes{suffix}",
             lambda: f"{item_text()} × {len(planes)} flat {'body' if len(planes) == 1 else 'bodies'}",
-            "" if planes else "spheres stand in for the bodies that cast shadows",
+            "" if planes else "no flat body casts shadows by its plane",
         )
         self._transfer = ExplainRow(
             f"transfer{suffix}",
