@@ -77,7 +77,7 @@ class ShadingContext:
         spheres: Centers and radii of the spheres.
         receivers: The points.
         call: Holds values of the points that may not be cached.
-        static_bodies: Those among moving ones; None where any may move.
+        static_bodies: The bodies that stay where they are in this call, while others move; None where any may move.
         normals: Node of the normals of all vertices, vec3 of shape [batch, vertex]; by default its own.
         blocker_kinds: Which bodies block light by something else than their spheres.
         is_scene_view: Whether bodies and points are where the scene and its camera have them, for good.

@@ -45,7 +45,7 @@ class ProjectedLight(Protocol):
 
 
 class SphereMethod(Method, Generic[Projected, FoundVisibility]):
-    """A method in which spheres, or planes and convex parts, stand in for bodies: visibility, transfer vectors, and shading.
+    """A method in which spheres, planes or convex parts stand in for bodies: visibility, transfer vectors, shading.
 
     Its two types are those of light and of visibility in its basis. A method gives these members, besides those of
     :class:`.Method` for bodies that shine:

@@ -8,10 +8,11 @@ Known of a side k, in a cell with direction ω and angular radius ρ (:mod:`warp
 
 1. Two sides k and j share a part of the cell around ω + ρ (y_k + y_j). Side j is in front in the share
 
-       S_kj = S((g_j − g_k)·(ω + ρ (y_k + y_j)) / ρ √(h_k h_j (|P(g_j − g_k)|² + 10⁻⁶ (|g_k|² + |g_j|²))))
+       S_kj = S(x),  x = (g_j − g_k)·(ω + ρ (y_k + y_j)) / ρ √(h_k h_j (|P(g_j − g_k)|² + 10⁻⁶ (|g_k|² + |g_j|²)))
 
-   of it: the line in which both sides meet cuts a disc as large as the shared part. P projects to the plane that
-   touches the sphere of directions, S is the smoothstep from 0 at −1 to 1 at 1.
+   of it. x is the signed distance of the line in which both sides meet, (g_j − g_k)·(ω + ρ y) = 0, from the middle
+   y_k + y_j of the shared part, over that part's radius √(h_k h_j). P projects to the plane that touches the sphere of
+   directions, the term of 10⁻⁶ is for sides at one distance, S is the smoothstep from 0 at −1 to 1 at 1.
 2. The sides in front of k leave the share o_k of the cell open, and block with the moment m_k:
 
        o_k = 1 − Σ_j S_kj h_j,  m_k = Σ_j S_kj μ_j

@@ -16,9 +16,10 @@ column, with 1 in place of ω:
 
     dx = α da_x + β db_x, on screen         α, β: the point on the edge is α a + β b in clip space, scaled to w = 1
 
-Between two neighbors of which one sees the surface there is an odd number of edges. One of them is found; the others
-cancel in pairs, since they move alike. (By the edge's normal they would not: along a border with teeth of a sample
-gradients had the wrong sign.)
+Between two neighbors of which one sees the surface there is an odd number of edges, and the image changes by Σ ± dx,
+with alternating signs. One of them is found. The others come in pairs, an entry and an exit within a sample: where a
+body moves as a whole, both have the same dx along the row, and cancel. (By the edge's normal they would not: along a
+border with teeth of a sample gradients had the wrong sign.)
 
 **Intersections** have no points that move with the line, so they count by its normal, with ω:
 

@@ -22,7 +22,7 @@ BOUND_MARGIN = 1.001 + BLEND
 
 
 FOOTPRINT_SHARE = wp.constant(5.0 / 12.0)
-"""Squared half-width of a smoothstep over the area of a square, where a mean over the square has the same variance."""
+"""W² / f²: a smoothstep from −W to W has the variance W²/5, a mean over a square of side f has f²/12."""
 
 
 @wp.struct
@@ -79,7 +79,7 @@ class CapFunctions(NamedTuple):
     """Kernel functions on caps."""
 
     widen_cone: wp.Function  # cones by w: axis, cosine and sine of θ, d², receivers, cells → caps
-    spread: wp.Function  # by how much footprints add to sin²w at distances d from the edges of shadows: d², receivers
+    spread: wp.Function  # what footprints f² add to sin²w: W² / (d² + 2 W²), W² = f² 5/12; of d², receivers
     reaches_bundle: wp.Function  # whether a cap reaches a bundle for any receiver
     is_above_horizon: wp.Function  # whether a cap rises above the horizon of any receiver
     soft_edge: wp.Function  # direction, cap, 1/(hi−lo) → t in the falloff, and its smoothstep
