@@ -119,7 +119,7 @@ def run_length(device: wp.Device, width: int) -> int:
 
 
 def run_dimensions(device: wp.Device, run_count: int, instances: int) -> tuple[int, int]:
-    """Dimensions (outer, inner) of a launch over runs of samples of all instances, which a thread finds by `find_run`.
+    """Dimensions (outer, inner) of a launch over runs of samples of all instances, which :func:`split_launch` splits.
 
     CPU: runs are outer. One slice owns a run for all instances, so no other adds to the gradient of inputs that serve
     them all. GPU: instances are outer. The 32 threads of a warp own adjacent samples.
@@ -131,8 +131,8 @@ def run_dimensions(device: wp.Device, run_count: int, instances: int) -> tuple[i
 
 
 @wp.func
-def find_run(worker: int, row: int, column: int):
-    """Instance and run of a thread, by the row and column of its launch."""
+def split_launch(worker: int, row: int, column: int):
+    """Instance (or span) and run (or receiver) of a thread, by the row and column of a launch of `run_dimensions`."""
     return wp.where(worker < 0, row, column), wp.where(worker < 0, column, row)
 
 

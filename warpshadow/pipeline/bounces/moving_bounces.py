@@ -273,7 +273,7 @@ class MovingBounces:
             "of patch samples", (key, senders), lambda: self._patch_samples(make_visibility, proxies, points)
         )
         radiosity = self._radiosity(of_patch_samples, free_light, proxies, materials)
-        item_text = functools.partial(receiver_text, points.weak)
+        item_text = functools.partial(receiver_text, points.weak_reference)
         return BouncedShading(visibility, free_light, item_text, radiosity, self._gatherer(senders, item_text))
 
     def _patch_samples(

@@ -207,7 +207,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     def _sum_over_emitters(
         self, name: str, find: Callable[..., Any], points: ShadingContext, materials: Materials, *others: Node | Input
     ) -> Node:
-        emitters, weak_points = self.emitters, points.weak
+        emitters, weak_points = self.emitters, points.weak_reference
         portions_of = _find_portions_of(points)
 
         def find_in_portions(
@@ -297,7 +297,7 @@ class VisibilityNode(Node):
         suffix: str | None = None,
     ):
         self.method, self._portions_of = method, _find_portions_of(points)
-        self._progress, weak_points = method.progress and light is not None, points.weak
+        self._progress, weak_points = method.progress and light is not None, points.weak_reference
         suffix, planes = points.suffix if suffix is None else suffix, points.blocker_kinds.planes
         item_text = functools.partial(receiver_text, weak_points)
         self._visibility = ExplainRow(
@@ -454,7 +454,7 @@ def _self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds, projecte
 
 def _static_shadows_node(method: SphereMethod, points: ShadingContext, light: Input | None) -> Node:
     """Node of cached transmittance past static bodies; its value is None if there are none."""
-    static_bodies, weak_points = points.static_bodies, points.weak
+    static_bodies, weak_points = points.static_bodies, points.weak_reference
     if static_bodies is None or not static_bodies.spheres[1].shape[1]:
         light_bounces = bool(method.merged_scene.scene.bounces)
         why = "light bounces: nothing of static bodies is cached" if light_bounces else "no static body has blockers"

@@ -119,7 +119,7 @@ def _distance_to_end(
 
 
 @wp.func
-def _let_follow(
+def _mark_mean_slope(
     fragments: FragmentArrays,
     entries: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
@@ -164,14 +164,14 @@ def _find_outline_samples(
         for k in range(4):
             is_at_outline = is_at_outline or _distance_to_end(fragments, entries, edges, sample, k) > 0.0
     if is_at_outline:
-        _let_follow(fragments, entries, edges, sides, keys, has_mean_slope, sample)
+        _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, sample)
         for k in range(4):
             on_path = sample
             steps = int(0)
             while steps < reach and _distance_to_end(fragments, entries, edges, on_path, k) == -1.0:
                 on_path = neighbor(on_path, k, fragments.width)
                 steps += 1
-                _let_follow(fragments, entries, edges, sides, keys, has_mean_slope, on_path)
+                _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, on_path)
                 for turn in range(2):
                     direction = wp.where(k < 2, 2, 0) + turn
                     end = on_path
@@ -179,7 +179,7 @@ def _find_outline_samples(
                     while further_steps < reach and _distance_to_end(fragments, entries, edges, end, direction) == -1.0:
                         end = neighbor(end, direction, fragments.width)
                         further_steps += 1
-                        _let_follow(fragments, entries, edges, sides, keys, has_mean_slope, end)
+                        _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, end)
 
 
 def find_outline_samples(
