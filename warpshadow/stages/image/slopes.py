@@ -56,6 +56,7 @@ from warpshadow.stages.raster.screen import (
     sample_center,
 )
 from warpshadow.stages.receivers.quadtree import Quadtree
+from warpshadow.stages.silhouettes.areas import LineArea
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import Silhouettes
 from warpshadow.stages.silhouettes.lines import (
@@ -257,7 +258,7 @@ def _add_shading_gradients(
     fragments: FragmentArrays,
     entries: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
-    shares: wp.array2d(dtype=wp.vec3),
+    line_areas: wp.array2d(dtype=LineArea),
     edge_colors: wp.array3d(dtype=wp.vec4),
     has_mean_slope: wp.array2d(dtype=wp.bool),
     albedo_has_mean_slope: wp.array2d(dtype=wp.bool),
@@ -311,7 +312,9 @@ def _add_shading_gradients(
                 if not is_flat:
                     extents = wp.vec2(1.0, 1.0)
                     if entry >= 0:
-                        image_weight = wp.max(find_image_weight(fragment, entry, entries, shares, width), MIN_WEIGHT)
+                        image_weight = wp.max(
+                            find_image_weight(fragment, entry, entries, line_areas, width), MIN_WEIGHT
+                        )
                     for direction in range(4):
                         edge = wp.vec2i(NOTHING, NOTHING)
                         if entry >= 0:
@@ -426,7 +429,7 @@ def moving_radiance(
                 make_fragment_arrays(silhouettes.fragments, silhouettes.faces, clip_positions),
                 silhouettes.entries,
                 silhouettes.edges,
-                silhouettes.shares,
+                silhouettes.line_areas,
                 edge_colors,
                 has_mean_slope,
                 albedo_has_mean_slope,
