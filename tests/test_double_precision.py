@@ -1,4 +1,4 @@
-"""Every differentiable stage, built in float64, against central differences: what float32 would round away."""
+"""Stages built in float64, against central differences: what float32 would round away."""
 
 import importlib
 
@@ -605,7 +605,7 @@ def test_gradients_of_a_band_are_exact(double, device, check, across):
     check(smooth, (wp.vec3d, random(0, 1, SIZE[1], SIZE[0], 3)), (wp.vec4d, clip_positions))
 
 
-def test_gradients_of_exposure_are_exact(double, device, check, clip):
+def test_gradients_of_film_are_exact(double, device, check, clip):
     faces = put(FACES, wp.vec3i, device)
     face_ids = double("stages.raster.rasterization").rasterize(put(clip[1], wp.vec4d, device), faces, *SIZE).face_ids
 

@@ -131,7 +131,8 @@ def has_adjoint_by_hand(text):
 
 
 def test_every_adjoint_by_hand_stands_on_the_page_of_stages_with_its_reason_and_folder():
-    (table,) = re.findall(r"^\| why \|.*\n(?:\|.*\n)+", (STAGES / "README.md").read_text("utf-8"), re.MULTILINE)
+    page = (STAGES / "README.md").read_text("utf-8")
+    (table,) = re.findall(r"^\| why \|.*\n(?:\|.*\n)+", page, re.MULTILINE)
     named = set(re.findall(r"`([\w/]+(?:\.py|/))`", table))
     assert not [name for name in named if not (STAGES / name).exists()]
     texts = {file.relative_to(STAGES).as_posix(): file.read_text("utf-8") for file in STAGES.rglob("*.py")}
@@ -139,6 +140,10 @@ def test_every_adjoint_by_hand_stands_on_the_page_of_stages_with_its_reason_and_
     assert len(by_hand) > 20
     assert not [name for name in by_hand if name not in named and f"{name.partition('/')[0]}/" not in named]
     assert not [name for name in named if name in texts and "adjoint" not in texts[name]]
+    shared = {name for name, text in texts.items() if re.search(r"@wp\.func.*\n *def \w*adjoint", text)} - by_hand
+    (list_of_shared,) = re.findall(r"^Functions that these.*(?:\n.+)+", page, re.MULTILINE)
+    named |= set(re.findall(r"`([\w/]+\.py)`", list_of_shared))
+    assert len(shared) > 5 and not [name for name in shared - named if f"{name.partition('/')[0]}/" not in named]
 
 
 def test_every_room_of_the_pipeline_stands_on_its_page_with_classes_that_it_has():

@@ -1,6 +1,6 @@
 """Comments in a kernel's signature: arguments under ``# out`` are outputs of its launches, those under ``# sums`` sums.
 
-Only one row writes to a place of an output, while all rows add to a sum, which is then of one thread each or atomic.
+In a launch with a cost one row writes to a place of an output, and all rows add to a sum; see ``launch``.
 """
 
 import ast

@@ -10,11 +10,11 @@ from warpshadow.device.batch import accumulate, instance_in
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.parallel import (
     Scratch,
-    find_run,
     run_dimensions,
     run_length,
     scratch_slot,
     set_thread_count,
+    split_launch,
     strip_count,
 )
 from warpshadow.device.tape import recorded
@@ -252,7 +252,7 @@ def _name_runs(
 ):
     """A thread owns a run."""
     row, column = wp.tid()
-    instance, run = find_run(worker, first_row + row, column)
+    instance, run = split_launch(worker, first_row + row, column)
     runs[instance, run] = wp.vec2i(instance, run)
 
 

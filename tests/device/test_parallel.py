@@ -239,7 +239,7 @@ def moved_balls():
     tape.backward()
     fragments = rasterize(clip, faces, 32, 32)
     silhouettes = find_silhouettes(fragments, faces, edges, clip)
-    found = normals, moved.grad, *fragments.rows, silhouettes.samples, silhouettes.edges, silhouettes.shares
+    found = normals, moved.grad, *fragments.rows, silhouettes.samples, silhouettes.edges, silhouettes.line_areas
     return [array.numpy().tobytes() for array in found]
 
 

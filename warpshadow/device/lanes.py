@@ -169,9 +169,9 @@ def _set_vector_options(module_name: str) -> None:
     wp.set_module_options(module_options(CHUNK), sys.modules[module_name])
 
 
-def block_count(vertex_count: int, lanes: int) -> int:
-    """Blocks, and so threads, that ``vertex_count`` receivers take."""
-    return -(-vertex_count // lanes)
+def block_count(receiver_count: int, lanes: int) -> int:
+    """Blocks, and so threads, that ``receiver_count`` receivers take."""
+    return -(-receiver_count // lanes)
 
 
 def span_count(device: wp.Device, direction_count: int) -> int:
@@ -271,26 +271,26 @@ def is_positive_in_chunk(value: Chunk):
 
 
 def _on_columns(statement: str, lanes: int) -> str:
-    """C++ that runs a statement on each ``number`` of rows of a block's vertices and its ``item`` of scratch memory.
+    """C++ that runs a statement on each ``number`` of rows of a block's receivers and its ``item`` of scratch memory.
 
     Plain Warp finds the address of each number anew, and loads or stores a whole vector for it. For one lane that
     takes fewer registers than addresses that are kept.
     """
     if lanes == 1:
         return f"""
-        const int vertex_count = block < rows.shape[0] ? 1 : 0;
-        for (int k = 0; k < vertex_count * count; ++k) {{
+        const int receiver_count = block < rows.shape[0] ? 1 : 0;
+        for (int k = 0; k < receiver_count * count; ++k) {{
             wp::float32& number = wp::index(rows, block, begin + k);
             wp::float32& item = wp::index(scratch, first + k).c[0];
             {statement};
         }}
         """
     return f"""
-    const int first_vertex = block * {lanes};
-    const int vertex_count = rows.shape[0] - first_vertex < {lanes} ? rows.shape[0] - first_vertex : {lanes};
+    const int first_receiver = block * {lanes};
+    const int receiver_count = rows.shape[0] - first_receiver < {lanes} ? rows.shape[0] - first_receiver : {lanes};
     const int column_step = rows.strides[1] / (int)sizeof(wp::float32);
-    for (int lane = 0; lane < vertex_count; ++lane) {{
-        wp::float32* row = &wp::index(rows, first_vertex + lane, begin);
+    for (int lane = 0; lane < receiver_count; ++lane) {{
+        wp::float32* row = &wp::index(rows, first_receiver + lane, begin);
         wp::float32* lane_items = &wp::index(scratch, first).c[lane];
         for (int k = 0; k < count; ++k) {{
             wp::float32& number = row[k * column_step];
@@ -363,9 +363,9 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
         return Vectors(a.x - b.x, a.y - b.y, a.z - b.z)
 
     @wp.func
-    def find_block(row: int, vertex_count: int):
+    def find_block(row: int, receiver_count: int):
         """Instance and block of a row, where the blocks of all instances follow each other."""
-        return split_row(row, (vertex_count + (lanes - 1)) // lanes)
+        return split_row(row, (receiver_count + (lanes - 1)) // lanes)
 
     @wp.func
     def load(values: wp.array(dtype=wp.vec3), block: int):
@@ -390,7 +390,7 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
     @wp.func_native(
         _on_columns("item = number", lanes)
         + f"""
-    for (int lane = vertex_count; lane < {lanes}; ++lane)
+    for (int lane = receiver_count; lane < {lanes}; ++lane)
         for (int k = 0; k < count; ++k)
             wp::index(scratch, first + k).c[lane] = outside;
     """
@@ -446,7 +446,7 @@ def make_lane_functions(lanes: int) -> LaneFunctions:
 
     @wp.func
     def load_rows(rows: wp.array2d(dtype=wp.float32), block: int, scratch: wp.array(dtype=Lane)):
-        """scratch[k] = rows[the block's vertices, k], 0 past the last vertex."""
+        """scratch[k] = rows[the block's vertices, k], 0 past the last receiver."""
         load_columns(rows, 0, rows.shape[1], block, 0.0, scratch, 0)
 
     @wp.func

@@ -40,7 +40,7 @@ def launch(
     | ``inputs`` | reads them | one row adds to a place in their gradients |
     | … those ``shared`` by rows | reads them | all rows add to their gradients |
     | ``scratch`` | a row for each worker on a CPU, for each thread on a GPU, if it has a cost | knows it not |
-    | ``outputs`` | one row writes to a place in them | they require a gradient |
+    | ``outputs`` | one row writes to a place in them; without a cost any, atomically | they require a gradient |
     | ``sums``, None to skip one | all rows add to them | knows them not |
 
     Args:

@@ -119,18 +119,20 @@ def run_length(device: wp.Device, width: int) -> int:
 
 
 def run_dimensions(device: wp.Device, run_count: int, instances: int) -> tuple[int, int]:
-    """Dimensions of a launch over runs of samples of all instances; :func:`find_run` says which run a thread owns.
+    """Dimensions (outer, inner) of a launch over runs of samples of all instances, which :func:`split_launch` splits.
 
-    On a CPU a slice has all instances of a run, so no other adds to the gradient of inputs that serve them all. On a
-    GPU neighboring threads own neighboring samples. (So it is with receivers and spans of directions in place of
-    instances: the 32 threads of a warp then ask for the same directions at neighboring receivers, and go the same way.)
+    CPU: runs are outer. One slice owns a run for all instances, so no other adds to the gradient of inputs that serve
+    them all. GPU: instances are outer. The 32 threads of a warp own adjacent samples.
+
+    A run may also be a receiver, and spans of directions take the place of instances: a warp then asks for the same
+    directions at adjacent receivers, and its threads go the same way.
     """
     return (instances, run_count) if device.is_cuda else (run_count, instances)
 
 
 @wp.func
-def find_run(worker: int, row: int, column: int):
-    """Instance and run of a thread, by the row and column of its launch."""
+def split_launch(worker: int, row: int, column: int):
+    """Instance (or span) and run (or receiver) of a thread, by the row and column of a launch of `run_dimensions`."""
     return wp.where(worker < 0, row, column), wp.where(worker < 0, column, row)
 
 

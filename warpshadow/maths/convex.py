@@ -12,7 +12,7 @@ from warpshadow.maths.adjacency import area_normals, edges_of
 from warpshadow.maths.components import connected_components
 from warpshadow.maths.outline import cut_outline, find_outline
 from warpshadow.maths.panels import MAX_FLAT_PANELS_OF, MAX_PANELS_OF, find_panels_of_sheets
-from warpshadow.maths.shells import find_layer
+from warpshadow.maths.thin_walls import find_layer
 from warpshadow.maths.tubes import MAX_SEGMENTS, find_tube
 
 MAX_FACES = 64  # faces of a part at most; a cylinder of 48 sides has 50
@@ -82,8 +82,8 @@ def find_convex_parts(
         The parts, which may touch and overlap: for each closed piece of the mesh a solid, or the prisms into which it
         is cut if it is one, with holes or without, or the segments of a bent tube; panels for each open one. They come
         by pieces, and in each the seams come last. Panels of sheets that share edges are of one piece. A piece around a
-        thin wall (:mod:`.shells`), closed but for pinholes, has one-sided panels: those for receivers outside are one
-        piece, those for receivers inside another, as a receiver may see both walls of a mug behind each other. None
+        thin wall (:mod:`.thin_walls`), closed but for pinholes, has one-sided panels: those for receivers outside are
+        one piece, those for receivers inside another, as a receiver may see both walls of a mug behind each other. None
         where a closed piece is hollow or curved otherwise, where a part has more than 64 faces, or where there are more
         than 32 prisms of a piece, 128 segments of all tubes, or 352 panels (64 flat ones).
     """

@@ -2,18 +2,19 @@
 
 A cell is a disc of radius ρ around its direction ω, in the plane that touches the sphere of directions there. The plane
 through a receiver x and an edge of the outline from a to b, n = (a − x) × (b − x) towards the shape, cuts the touching
-plane in a line. Its signed distance d from ω is positive where ω is on the side of the shape; along it the edge runs
-from s₀ to s₁ within the disc:
+plane in a line. Its signed distance d from ω is positive where ω is on the side of the shape; along it, the
+edge within the disc is from s₀, towards b, to s₁, towards a: t runs against the edge.
 
-    d = m·ω / √(1 − (m·ω)²),  m = n / |n|,  s = (a − x)·t / (a − x)·ω,  t = ω × m / |ω × m|
+    d = m·ω / √(1 − (m·ω)²),  m = n / |n|,  t = ω × m / |ω × m|,  position of a: (a − x)·t / (a − x)·ω
 
 The area of the disc inside the outline is that of the whole disc, as often as the outline winds around ω, and for each
 edge the area between the edge and the disc's border:
 
     π ρ² h = π ρ² w + ½ Σ_edges d (s₁ − s₀) − ρ² sign(d) atan2(|d| (s₁ − s₀), d² + s₀ s₁)
 
-The angles add up to that of the product of complex numbers d² + s₀ s₁ − i d (s₁ − s₀), and a turn each time that it
-crosses the negative axis: one arc tangent for a cell, not one for an edge, which takes 12 to 20% less time.
+Angles are added by multiplying complex numbers d² + s₀ s₁ − i d (s₁ − s₀). The arc tangent of the product loses whole
+turns, so its crossings of the negative axis are counted. One arc tangent for a cell, not one for an edge, takes 12 to
+20% less time.
 
 The first moment says where in the cell the shape is. By Green's theorem, with n̂ the unit vector across the line,
 towards the shape:

@@ -12,7 +12,8 @@ Moments tell which: of blockers beside each other they point apart, of blockers 
     k = Σ_{i≠j} μ_i·μ_j / Σ_{i≠j} ν(h_i) ν(h_j)
     T = (1 − |k|) Π (1 − h) + |k| (max(0, 1 − Σ h) where k < 0, else 1 − max h)
 
-Together they cover h = 1 − T, with the moment μ = T′ Σ μ, T′ = (1 − T) / Σ h.
+Together they cover h = 1 − T, with the moment μ = T′ Σ μ, T′ = (1 − T) / Σ h. (The kernels below find T past two
+blockers, :mod:`.convex.joint_lanes` h and μ of any number.)
 
 A barn of planks under an even sky is 2% off, as if blockers were independent it would be 23% too bright.
 """

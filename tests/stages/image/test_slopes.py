@@ -86,18 +86,19 @@ class Drawn:
 
 def image_weight(drawn, sample):
     """Weight of a sample in all of the smoothed image."""
-    entries, shares = drawn.silhouettes.entries.numpy(), drawn.silhouettes.shares.numpy().astype(float)
+    entries = drawn.silhouettes.entries.numpy()
+    areas = drawn.silhouettes.line_areas.numpy().view(np.float32).reshape(-1, 4, 3).astype(float)
     if entries[sample] < 0:
         return 1.0
 
     def taken(number, side):
-        (area, weight, end), across = shares[number, side], shares[number, [2, 3] if side < 2 else [0, 1]]
+        (area, weight, end), across = areas[number, side], areas[number, [2, 3] if side < 2 else [0, 1]]
         losses = 0.5 * (1 + across[:, 2] - end) * np.maximum(weight + across[:, 1] - 1, 0) * across[:, 0]
         return area * (weight - losses.sum())
 
     total = 1.0
     for side, step in enumerate([1, -1, CAMERA.width, -CAMERA.width]):
-        if shares[entries[sample], side, 1] > 0:
+        if areas[entries[sample], side, 1] > 0:
             total += taken(entries[sample + step], side ^ 1) - taken(entries[sample], side)
     return max(total, MIN_WEIGHT)
 

@@ -44,26 +44,6 @@ from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.receivers.find import Receivers
 
 
-class TransferForBounces(TransferNode):
-    """Receivers in free light, a list of :class:`PortionForBounces`: transfer vectors, and transmittance of cells."""
-
-    def result_of(self, portion: LitPortion) -> PortionForBounces:
-        """Visibility of a portion."""
-        return _portion_for_bounces(self.method, portion)
-
-
-class ShadingForBounces(ShadingNode):
-    """Receivers in known light, a list of :class:`PortionForBounces`: direct light, and transmittance of cells."""
-
-    def compute(self, call: Call) -> Any:
-        """Shade all portions."""
-        return list(self.portions(call))
-
-    def result_of(self, portion: LitPortion) -> PortionForBounces:
-        """Light and visibility of a portion."""
-        return _portion_for_bounces(self.method, portion)
-
-
 def _portion_for_bounces(method: SphereMethod, portion: LitPortion) -> PortionForBounces:
     transmittance = find_cell_transmittance(method, portion.group, portion.visibility, portion.spheres)
     return PortionForBounces(portion.result, portion.group, transmittance)
@@ -73,7 +53,8 @@ class DirectLightNode(Node):
     """Direct light, in portions.
 
     Args:
-        visibility: Visibility of the receivers in free light, or their direct light if it is known.
+        visibility: Visibility of the receivers in free light, or their direct light if it is known, a list of
+            :class:`PortionForBounces`.
         free_light: Free light projected for the method; None if light is known.
         item_text: Number of receivers, in words.
         suffix: Ends the name of its stage.
@@ -83,7 +64,7 @@ class DirectLightNode(Node):
 
     def __init__(
         self,
-        visibility: TransferForBounces | ShadingForBounces,
+        visibility: TransferNode,
         free_light: Node | None,
         item_text: str | Callable[[], str],
         suffix: str = "",
@@ -137,7 +118,7 @@ class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
     points: ShadingContext
-    visibility: TransferForBounces | ShadingForBounces  # of the patch samples
+    visibility: TransferNode  # of the patch samples, a list of PortionForBounces
     frames: Node  # of flat bodies
     placed_proxies: Node  # proxies of the patches, in the world
     weights: Node  # of patch samples and patches, by how open they are
@@ -212,7 +193,7 @@ class BouncedShading(DirectLightNode):
 
     def __init__(
         self,
-        visibility: TransferForBounces | ShadingForBounces,
+        visibility: TransferNode,
         free_light: Node | None,
         item_text: Callable[[], str],
         radiosity: Radiosity,
@@ -261,10 +242,12 @@ class MovingBounces:
             return Node("bounces", identity, direct, idle="every body is black")
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
         make_visibility = functools.partial(
-            TransferForBounces if light.is_free else ShadingForBounces,
+            TransferNode if light.is_free else ShadingNode,
             method,
             projected_light=method.visibility_basis(points, light),
             light=light,
+            result_of=functools.partial(_portion_for_bounces, method),
+            join=identity,
         )
         free_light = projected_light if light.is_free else None
         key, is_cached = light.visibility_key, light.is_free or materials is not points.materials
@@ -273,14 +256,11 @@ class MovingBounces:
             "of patch samples", (key, senders), lambda: self._patch_samples(make_visibility, proxies, points)
         )
         radiosity = self._radiosity(of_patch_samples, free_light, proxies, materials)
-        item_text = functools.partial(receiver_text, points.weak)
+        item_text = functools.partial(receiver_text, points.weak_reference)
         return BouncedShading(visibility, free_light, item_text, radiosity, self._gatherer(senders, item_text))
 
     def _patch_samples(
-        self,
-        make_visibility: Callable[..., TransferForBounces | ShadingForBounces],
-        proxies: Proxies,
-        points: ShadingContext,
+        self, make_visibility: Callable[..., TransferNode], proxies: Proxies, points: ShadingContext
     ) -> PatchSampleNodes:
         """Nodes of the patch samples of the bodies around points."""
         senders, planes, spheres = proxies.senders, proxies.planes, points.spheres

@@ -296,6 +296,6 @@ def lit_patch_samples(
         normals=points.normals,
         blocker_kinds=points.blocker_kinds,
         nearest_spheres=nearest_spheres,
-        neighbors=points,
+        shares_cache_with=points,
         suffix=OF_PATCH_SAMPLES,
     )

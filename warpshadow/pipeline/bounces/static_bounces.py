@@ -155,7 +155,7 @@ class StaticBounces:
         return field_of(self._factors(points, materials, senders, at_patch_samples), "openness")
 
     def _item_text(self, points: ShadingContext, senders: Senders) -> Callable[[], str]:
-        weak_points = points.weak
+        weak_points = points.weak_reference
         return lambda: f"{receiver_text(weak_points)}, {len(senders.areas):,} patches, {self._bounces} bounces"
 
     def _factors(

@@ -1,8 +1,8 @@
 """Form factors between static patches, and from them to receivers: by rays, once for a geometry.
 
-Form factors F of a point are scaled so that they sum to 1 − s. Direct light and form factors estimate the same openness
-by different means: spheres leave the share s of the hemisphere open, rays hit bodies in the share f. Unscaled they lose
-and gain energy: eighteen white balls in a white furnace were 0.91 to 1.06 bright.
+The form factors F of a point are scaled so that s + Σ F = 1, where s is the part of the hemisphere that spheres leave
+open, by which direct light goes. Rays hit bodies in another part than 1 − s; unscaled, energy was lost and gained:
+eighteen white balls in a white furnace were 0.91 to 1.06 bright.
 
 Points inside another body count neither in means over patch samples nor as cache points: they see its inside. A patch
 whose samples are all inside has the light of the nearest patch of its body, as a part between them may be seen.

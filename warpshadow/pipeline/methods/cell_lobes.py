@@ -47,12 +47,12 @@ class CellLobes(LobeVisibility):
 
     def transmittance(self, lobes: LitLobes, directions: Node) -> Node:
         """Transmittance towards the samples of lobes, between cells; in known light, between where their light is."""
-        item_text = functools.partial(receiver_text, lobes.points.weak)
+        item_text = functools.partial(receiver_text, lobes.points.weak_reference)
         return Node("transmittance of lobes", _interpolate, *self._cells(lobes), directions, items=item_text)
 
     def sun_transmittance(self, lobes: LitLobes, suns: Node) -> Node:
         """Transmittance towards suns, of their cells."""
-        item_text = functools.partial(receiver_text, lobes.points.weak)
+        item_text = functools.partial(receiver_text, lobes.points.weak_reference)
         find = functools.partial(_find_sun_transmittance, self._middles)
         return Node("transmittance of suns", find, *self._cells(lobes), suns, items=item_text)
 

@@ -1,4 +1,4 @@
-"""The directional method: transmittance of the spheres for cells of directions, lit by the light of each cell."""
+"""The directional method: transmittance past blockers for cells of directions, lit by the light of each cell."""
 
 import functools
 from collections.abc import Callable

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from warpshadow.pipeline.node import Call, Node
+from warpshadow.pipeline.node import Node
 from warpshadow.pipeline.receivers.groups import CellVisibility
 from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.shading.light_input import LightInput
@@ -20,14 +20,17 @@ CellMethod = SphereMethod[ProjectedCells, CellVisibility]
 
 def shading_with_cells(method: CellMethod, points: ShadingContext, light: LightInput) -> Node:
     """Node of the :class:`ShadingAndTransmittance` of points in known light that does not bounce."""
-    make = functools.partial(_ShadingWithCells, method, points, method.projected_light(points, light), light)
+    find, join = functools.partial(_shading_and_cells, method), functools.partial(_join_both, method)
+    arguments = method, points, method.projected_light(points, light), light
+    make = functools.partial(ShadingNode, *arguments, result_of=find, join=join)
     return method.cached_for_light("direct with cells", points, light, make)
 
 
 def transmittance_of_cells(method: CellMethod, points: ShadingContext, light: LightInput) -> Node:
     """Node of the transmittance of points towards cells, float32 of shape [batch, receiver, direction]."""
     arguments = method, points, method.visibility_basis(points, light), None
-    make = functools.partial(_TransmittanceOfCells, *arguments, suffix=" of gloss")
+    join = functools.partial(_join, method)
+    make = functools.partial(VisibilityNode, *arguments, suffix=" of gloss", result_of=_transmittance_of, join=join)
     return points.cached("cells", light.visibility_key, make)
 
 
@@ -38,32 +41,17 @@ class ShadingAndTransmittance(NamedTuple):
     transmittance: wp.array  # of receivers on bodies that shine, float32 of shape [batch, receiver, direction]
 
 
-class _ShadingWithCells(ShadingNode):
-    """Shading of receivers, and the transmittance of cells at bodies that shine."""
-
-    def compute(self, call: Call) -> ShadingAndTransmittance:
-        """Shade all portions."""
-        portions = list(self.portions(call))
-        cells = [transmittance for _, transmittance in portions if transmittance is not None]
-        return ShadingAndTransmittance(join_portions([shading for shading, _ in portions]), _join(self.method, cells))
-
-    def result_of(self, portion: LitPortion) -> tuple[wp.array, wp.array | None]:
-        """Shading of a portion, and the transmittance of its cells if its body shines."""
-        body = portion.group.body
-        is_glossy = body is not None and self.method.merged_scene.is_glossy[body]
-        return portion.result, _transmittance_of(portion) if is_glossy else None
+def _shading_and_cells(method: CellMethod, portion: LitPortion) -> tuple[wp.array, wp.array | None]:
+    """Shading of a portion, and the transmittance of its cells if its body shines."""
+    body = portion.group.body
+    is_glossy = body is not None and method.merged_scene.is_glossy[body]
+    return portion.result, _transmittance_of(portion) if is_glossy else None
 
 
-class _TransmittanceOfCells(VisibilityNode):
-    """Transmittance of receivers towards cells, float32 of shape [batch, receiver, direction]."""
-
-    def compute(self, call: Call) -> wp.array:
-        """Find it for all portions."""
-        return _join(self.method, list(self.portions(call)))
-
-    def result_of(self, portion: LitPortion) -> wp.array | None:
-        """Transmittance of the cells of a portion."""
-        return _transmittance_of(portion)
+def _join_both(method: CellMethod, portions: list[tuple[wp.array, wp.array | None]]) -> ShadingAndTransmittance:
+    """Join the shading of portions, and the transmittance of cells that some have. Differentiable: portions."""
+    cells = [transmittance for _, transmittance in portions if transmittance is not None]
+    return ShadingAndTransmittance(join_portions([shading for shading, _ in portions]), _join(method, cells))
 
 
 def _transmittance_of(portion: LitPortion) -> wp.array | None:

@@ -118,7 +118,7 @@ def path_traced(
             wp.copy(bounced[instance], light)
         return add_light(shading, bounced)
 
-    weak_points = points.weak
+    weak_points = points.weak_reference
     return Node(
         "bounces",
         trace,

@@ -54,7 +54,7 @@ class RayTraced(Method):
             points.receivers_node,
             light,
             self.shell_of(light),
-            items=functools.partial(receiver_text, points.weak),
+            items=functools.partial(receiver_text, points.weak_reference),
             rows=(ExplainRow("transfer", idle="rays shade known light at once"),),
         )
 
@@ -81,7 +81,7 @@ class RayTraced(Method):
         receivers, samples = points.receivers_node, self.emitters.samples_node(points)
 
         def traced() -> Node:
-            name, items = f"rays to emitters{points.suffix}", functools.partial(receiver_text, points.weak)
+            name, items = f"rays to emitters{points.suffix}", functools.partial(receiver_text, points.weak_reference)
             arguments = points.vertices, receivers, samples
             return Node(name, self._trace_emitters, *arguments, items=items, has_adjoint=False)
 
@@ -113,7 +113,7 @@ class RayTraced(Method):
 
     def transfers(self, points: ShadingContext, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
-        weak_points = points.weak
+        weak_points = points.weak_reference
         node = Node(
             f"transfer{points.suffix}",
             self._transfer,
@@ -142,7 +142,7 @@ class RayTraced(Method):
         """Node of the meshes that rays from points meet."""
 
         def meshes() -> Node:
-            weak_points = points.weak
+            weak_points = points.weak_reference
             return Node(
                 f"visibility{points.suffix}",
                 self._blocker_meshes,
@@ -227,7 +227,7 @@ class TracedLobes(LobeVisibility):
         """Transmittance towards the samples of lobes."""
         points = lobes.points
         arguments = self._method.trees_around(points), points.receivers_node, directions
-        item_text = functools.partial(receiver_text, points.weak)
+        item_text = functools.partial(receiver_text, points.weak_reference)
         return Node("transmittance of lobes", _trace_lobes, *arguments, items=item_text)
 
     def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:

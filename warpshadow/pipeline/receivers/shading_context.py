@@ -77,13 +77,13 @@ class ShadingContext:
         spheres: Centers and radii of the spheres.
         receivers: The points.
         call: Holds values of the points that may not be cached.
-        static_bodies: Those among moving ones; None where any may move.
+        static_bodies: The bodies that stay where they are in this call, while others move; None where any may move.
         normals: Node of the normals of all vertices, vec3 of shape [batch, vertex]; by default its own.
         blocker_kinds: Which bodies block light by something else than their spheres.
         is_scene_view: Whether bodies and points are where the scene and its camera have them, for good.
         nearest_spheres: Where the points are patch samples, the sphere nearest to the patch of each: its index among
             the spheres of bodies that are not flat, −1 for none; NumPy of shape [receiver]. None for other points.
-        neighbors: Other points among the same bodies, with which values of these are shared.
+        shares_cache_with: Other points among the same bodies, with which values of these are shared.
         suffix: Put after the names of stages, to tell them from those of other points.
     """
 
@@ -100,7 +100,7 @@ class ShadingContext:
         blocker_kinds: BlockerKinds = ONLY_SPHERES,
         is_scene_view: bool = False,
         nearest_spheres: np.ndarray | None = None,
-        neighbors: ShadingContext | None = None,
+        shares_cache_with: ShadingContext | None = None,
         suffix: str = "",
     ):
         self.suffix = suffix
@@ -111,8 +111,8 @@ class ShadingContext:
         self.normals = Node("", vertex_normals, vertices, merged_scene.one_rings) if normals is None else normals
         self._cached: dict[str, tuple[Hashable, Any]] = {}
         self._cached_with_neighbors: dict[str, tuple[Hashable, Any]] = {}
-        if neighbors is not None:
-            self._cached_with_neighbors = neighbors._cached_with_neighbors
+        if shares_cache_with is not None:
+            self._cached_with_neighbors = shares_cache_with._cached_with_neighbors
 
     def cached(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
         """A value for the points, such as a node, cached under a name while its inputs stay the same."""
@@ -144,7 +144,7 @@ class ShadingContext:
         return points
 
     @property
-    def weak(self: Context) -> Context:
+    def weak_reference(self: Context) -> Context:
         """A weak reference to the points, for functions that put a node of theirs into words.
 
         These must not hold the points, which hold the node: arrays would stay until Python collects garbage.

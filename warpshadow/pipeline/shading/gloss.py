@@ -57,7 +57,7 @@ def mix_gloss(
         Nodes of the light that colored and that white surfaces reflect, vec3 of shape [batch, receiver].
     """
     points, light, visibility = lobes.points, lobes.light, method.lobes
-    item_text = functools.partial(receiver_text, points.weak)
+    item_text = functools.partial(receiver_text, points.weak_reference)
     values = {name: _find_values(points, materials, name) for name in GLOSS_ARGUMENTS}
     roughness = values["roughness"]
 
@@ -110,7 +110,9 @@ def _look_up(
     shell = method.shell_of(light)
     if shell is not None:
         directions = Node("", exits_from_shell, starts, directions, shell)
-    return Node(name, look_up_light, texels, directions, filters, items=functools.partial(receiver_text, points.weak))
+    return Node(
+        name, look_up_light, texels, directions, filters, items=functools.partial(receiver_text, points.weak_reference)
+    )
 
 
 def _find_values(points: GlossyPoints, materials: Materials, name: str) -> Node:

@@ -44,7 +44,7 @@ class GlossyPoints(ShadingContext):
             normals=view.normals,
             blocker_kinds=view.blocker_kinds,
             is_scene_view=view.is_scene_view,
-            neighbors=view,
+            shares_cache_with=view,
         )
         self.numbers = Node("", functools.partial(_number_glossy, glossy), detached(self.all_receivers))
 

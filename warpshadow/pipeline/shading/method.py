@@ -200,7 +200,7 @@ class Method(abc.ABC):
         """Direct free light on points, which is converted where the transfer vectors are not."""
         transfers = self.cached_transfers(points, light.shell)
         matrix = self.native_from_basis if transfers.requires_grad else None
-        items = functools.partial(receiver_text, points.weak)
+        items = functools.partial(receiver_text, points.weak_reference)
         name, shade = f"shading{points.suffix}", functools.partial(shade_free, matrix=matrix)
         return Node(name, shade, transfers, light, items=items)
 

@@ -80,7 +80,7 @@ class MirroredBodies:
         def trace() -> Node:
             find = functools.partial(self._find_hits, mirrors)
             traced = points.vertices, points.normals, points.receivers_node, directions, transmittance
-            items = functools.partial(receiver_text, points.weak)
+            items = functools.partial(receiver_text, points.weak_reference)
             return Node("hits of lobes", find, *(detached(source) for source in traced), items=items)
 
         hits = points.cached("hits", (samples, light.visibility_key, mirrors), trace)

@@ -2,6 +2,7 @@
 
 import abc
 import functools
+import operator
 from collections.abc import Callable, Iterator
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
@@ -14,7 +15,7 @@ from warpshadow.device.constants import IdentityKey
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
-from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached
+from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached, identity
 from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_portions
 from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, BlockerKinds, ShadingContext, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
@@ -45,7 +46,7 @@ class ProjectedLight(Protocol):
 
 
 class SphereMethod(Method, Generic[Projected, FoundVisibility]):
-    """A method in which spheres stand in for the bodies: visibility, transfer vectors, and shading.
+    """A method in which spheres, planes or convex parts stand in for bodies: visibility, transfer vectors, shading.
 
     Its two types are those of light and of visibility in its basis. A method gives these members, besides those of
     :class:`.Method` for bodies that shine:
@@ -207,7 +208,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     def _sum_over_emitters(
         self, name: str, find: Callable[..., Any], points: ShadingContext, materials: Materials, *others: Node | Input
     ) -> Node:
-        emitters, weak_points = self.emitters, points.weak
+        emitters, weak_points = self.emitters, points.weak_reference
         portions_of = _find_portions_of(points)
 
         def find_in_portions(
@@ -282,9 +283,12 @@ class VisibilityNode(Node):
         light: Known or free light; None where it is not given yet.
         caches: As for :class:`Node`.
         suffix: Ends the names of its stages, such as " of patch samples"; by default the suffix of the points.
+        result_of: Result of a portion; by default the last step's.
+        join: Makes the value of the list of these; by default the list itself, of shading one array.
     """
 
     step_count = 2  # of the four steps: visibility, planes, transfer vectors, shading
+    join: Callable[[list[Any]], Any] = staticmethod(identity)
 
     def __init__(
         self,
@@ -295,9 +299,12 @@ class VisibilityNode(Node):
         *,
         caches: bool = True,
         suffix: str | None = None,
+        result_of: Callable[[LitPortion], Any] = operator.attrgetter("result"),
+        join: Callable[[list[Any]], Any] | None = None,
     ):
         self.method, self._portions_of = method, _find_portions_of(points)
-        self._progress, weak_points = method.progress and light is not None, points.weak
+        self._result_of, self._join = result_of, self.join if join is None else join
+        self._progress, weak_points = method.progress and light is not None, points.weak_reference
         suffix, planes = points.suffix if suffix is None else suffix, points.blocker_kinds.planes
         item_text = functools.partial(receiver_text, weak_points)
         self._visibility = ExplainRow(
@@ -308,7 +315,7 @@ class VisibilityNode(Node):
         self._planes = ExplainRow(
             f"planes{suffix}",
             lambda: f"{item_text()} × {len(planes)} flat {'body' if len(planes) == 1 else 'bodies'}",
-            "" if planes else "spheres stand in for the bodies that cast shadows",
+            "" if planes else "no flat body casts shadows by its plane",
         )
         self._transfer = ExplainRow(
             f"transfer{suffix}",
@@ -337,7 +344,7 @@ class VisibilityNode(Node):
 
     def compute(self, call: Call) -> Any:
         """Find it for all portions."""
-        return list(self.portions(call))
+        return self._join(list(self.portions(call)))
 
     def portions(self, call: Call) -> Iterator[Any]:
         """Find it for one portion after another."""
@@ -346,7 +353,7 @@ class VisibilityNode(Node):
         with progress_bar(total, "shading", "receiver", shows=self._progress) as bar:
             for group in self._portions_of(receivers, blockers, *cached):
                 portion = LitPortion(group, self._find_visibility(call, group, projected_light), blockers.spheres)
-                yield self.result_of(self.add_step(call, portion, projected_light))
+                yield self._result_of(self.add_step(call, portion, projected_light))
                 bar.update(group.points.shape[1])
 
     def _find_visibility(
@@ -362,10 +369,6 @@ class VisibilityNode(Node):
     def add_step(self, call: Call, portion: LitPortion, projected_light: ProjectedLight) -> LitPortion:
         """The portion with the result of the steps after visibility; none here."""
         return portion
-
-    def result_of(self, portion: LitPortion) -> Any:
-        """Its part of the results of a portion; by default the last step's."""
-        return portion.result
 
 
 class TransferNode(VisibilityNode):
@@ -385,15 +388,12 @@ class ShadingNode(TransferNode):
     """Shading of receivers, vec3 of shape [batch, receiver]."""
 
     step_count = 4
+    join = staticmethod(join_portions)
 
     @property
     def needs_transfer(self) -> bool:
         """Whether the method shades by transfer vectors."""
         return not self.method.shades_without_transfer
-
-    def compute(self, call: Call) -> Any:
-        """Shade all portions."""
-        return join_portions(list(self.portions(call)))
 
     def add_step(self, call: Call, portion: LitPortion, projected_light: ProjectedLight) -> LitPortion:
         """The portion with its shading."""
@@ -454,7 +454,7 @@ def _self_visibility(method: SphereMethod, blocker_kinds: BlockerKinds, projecte
 
 def _static_shadows_node(method: SphereMethod, points: ShadingContext, light: Input | None) -> Node:
     """Node of cached transmittance past static bodies; its value is None if there are none."""
-    static_bodies, weak_points = points.static_bodies, points.weak
+    static_bodies, weak_points = points.static_bodies, points.weak_reference
     if static_bodies is None or not static_bodies.spheres[1].shape[1]:
         light_bounces = bool(method.merged_scene.scene.bounces)
         why = "light bounces: nothing of static bodies is cached" if light_bounces else "no static body has blockers"

@@ -102,7 +102,7 @@ class View(ShadingContext):
     ) -> tuple[Node, Node]:
         """From the vertices to their normals and to the receivers."""
         merged_scene, samples = method.merged_scene, self._sample_text
-        corners = functools.partial(View._vertices, self.weak)
+        corners = functools.partial(View._vertices, self.weak_reference)
         faces, two_sided = merged_scene.faces, merged_scene.two_sided_faces
         if static_bodies is None or cameras.requires_grad:
             clip = Node("clip positions", to_clip, vertices, cameras, items=corners)
@@ -127,7 +127,7 @@ class View(ShadingContext):
             normals = Node("normals", static_bodies.with_moving_normals, vertices, static_bodies.normals, items=corners)
         # gradients of receivers: at vertices to the vertices alone, at samples to the fragments, too
         seen = sides if self._scene_receivers.at_samples(blocker_kinds).any() else detached(sides)
-        item_text = functools.partial(receiver_text, self.weak)
+        item_text = functools.partial(receiver_text, self.weak_reference)
         arguments = [vertices, normals, seen, detached(silhouettes), detached(clip)]
         if self._scene_receivers.is_adaptive.any():
             arguments.append(detached(spheres))

@@ -8,10 +8,11 @@ Known of a side k, in a cell with direction ω and angular radius ρ (:mod:`warp
 
 1. Two sides k and j share a part of the cell around ω + ρ (y_k + y_j). Side j is in front in the share
 
-       S_kj = S((g_j − g_k)·(ω + ρ (y_k + y_j)) / ρ √(h_k h_j (|P(g_j − g_k)|² + 10⁻⁶ (|g_k|² + |g_j|²))))
+       S_kj = S(x),  x = (g_j − g_k)·(ω + ρ (y_k + y_j)) / ρ √(h_k h_j (|P(g_j − g_k)|² + 10⁻⁶ (|g_k|² + |g_j|²)))
 
-   of it: the line in which both sides meet cuts a disc as large as the shared part. P projects to the plane that
-   touches the sphere of directions, S is the smoothstep from 0 at −1 to 1 at 1.
+   of it. x is the signed distance of the line in which both sides meet, (g_j − g_k)·(ω + ρ y) = 0, from the middle
+   y_k + y_j of the shared part, over that part's radius √(h_k h_j). P projects to the plane that touches the sphere of
+   directions, the term of 10⁻⁶ is for sides at one distance, S is the smoothstep from 0 at −1 to 1 at 1.
 2. The sides in front of k leave the share o_k of the cell open, and block with the moment m_k:
 
        o_k = 1 − Σ_j S_kj h_j,  m_k = Σ_j S_kj μ_j
@@ -207,15 +208,15 @@ def _block_each_other_adjoint(
 
 
 @wp.func
-def _open_part(hit: PlaneHit, before: wp.vec4):
+def _open_part(hit: PlaneHit, part_coverage: wp.vec4):
     """Share o of a side that neither nearer sides nor bodies before all planes block, and the moment m of these."""
-    share = wp.max(hit.open_share * (1.0 - before[0]), _MIN_OPEN)
-    return share, hit.blocked_moment + wp.vec3(before[1], before[2], before[3])
+    share = wp.max(hit.open_share * (1.0 - part_coverage[0]), _MIN_OPEN)
+    return share, hit.blocked_moment + wp.vec3(part_coverage[1], part_coverage[2], part_coverage[3])
 
 
 @wp.func
-def _is_wholly_open(hit: PlaneHit, before: wp.vec4):
-    return hit.open_share >= 1.0 and before[0] <= 0.0
+def _is_wholly_open(hit: PlaneHit, part_coverage: wp.vec4):
+    return hit.open_share >= 1.0 and part_coverage[0] <= 0.0
 
 
 @wp.func
@@ -226,20 +227,20 @@ def _unnormalized_direction(cell: VisibleCell, open_share: float, blocked_moment
 
 
 @wp.func
-def _visible_direction(cell: VisibleCell, hit: PlaneHit, before: wp.vec4):
+def _visible_direction(cell: VisibleCell, hit: PlaneHit, part_coverage: wp.vec4):
     """Direction of the open part of a side."""
-    if _is_wholly_open(hit, before):
+    if _is_wholly_open(hit, part_coverage):
         return cell.direction
-    open_share, blocked_moment = _open_part(hit, before)
+    open_share, blocked_moment = _open_part(hit, part_coverage)
     visible_direction, _ = _unnormalized_direction(cell, open_share, blocked_moment)
     return wp.normalize(visible_direction)
 
 
 @wp.func
-def _visible_footprint(planes: PlaneArrays, side: PlaneSide, cell: VisibleCell, hit: PlaneHit, before: wp.vec4):
+def _visible_footprint(planes: PlaneArrays, side: PlaneSide, cell: VisibleCell, hit: PlaneHit, part_coverage: wp.vec4):
     """Footprint of the open part of a side that is not wholly open."""
-    footprint = footprint_on_side(planes, side, _visible_direction(cell, hit, before))
-    open_share, _ = _open_part(hit, before)
+    footprint = footprint_on_side(planes, side, _visible_direction(cell, hit, part_coverage))
+    open_share, _ = _open_part(hit, part_coverage)
     footprint.extent = wp.sqrt(open_share)
     return footprint
 
@@ -250,7 +251,7 @@ def find_side_hits(
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
     weight: float,
-    before: wp.vec4,
+    part_coverage: wp.vec4,
     receiver: PlaneReceiver,
     hits: wp.array(dtype=PlaneHit),
 ):
@@ -278,15 +279,15 @@ def find_side_hits(
                 hit.mip = find_mip_footprint(side.grid, planes, hit.footprint)
                 if is_covered_by_texels(side.grid):
                     hit.mesh_share = fetch(planes.covered, planes, first_level, hit.mip)[0]
-                if _is_sender(side) and before[0] <= 0.0:  # else it is that of the part beside
+                if _is_sender(side) and part_coverage[0] <= 0.0:  # else it is that of the part beside
                     hit.radiosity = fetch(texels, planes, first_level, hit.mip)
             hit.coverage = outline[0] * hit.mesh_share
             hit.centroid = wp.vec3(outline[1], outline[2], outline[3]) / outline[0]
             hit.inverse_distance = inverse_distance_on_side(side)
             hits[i] = hit
             hit_count += 1
-    if hit_count > 1 or (hit_count > 0 and before[0] > 0.0):
-        _find_visible_parts(planes, cell, texels, before, receiver, hits)
+    if hit_count > 1 or (hit_count > 0 and part_coverage[0] > 0.0):
+        _find_visible_parts(planes, cell, texels, part_coverage, receiver, hits)
     return hit_count
 
 
@@ -295,7 +296,7 @@ def _find_visible_parts(
     planes: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
-    before: wp.vec4,
+    part_coverage: wp.vec4,
     receiver: PlaneReceiver,
     hits: wp.array(dtype=PlaneHit),
 ):
@@ -305,11 +306,11 @@ def _find_visible_parts(
             if is_hit(hits, k) and is_hit(hits, j):
                 _block_each_other(cell, k, j, hits)
     for i in range(receiver.side_count):
-        if is_hit(hits, i) and not _is_wholly_open(hits[i], before):
+        if is_hit(hits, i) and not _is_wholly_open(hits[i], part_coverage):
             hits[i].open_share = wp.max(hits[i].open_share, _MIN_OPEN)
             side = load_side(planes, receiver, i)
             if _is_sender(side):
-                footprint = _visible_footprint(planes, side, cell, hits[i], before)
+                footprint = _visible_footprint(planes, side, cell, hits[i], part_coverage)
                 mip = find_mip_footprint(side.grid, planes, footprint)
                 hits[i].footprint = footprint
                 hits[i].mip = mip
@@ -321,7 +322,7 @@ def find_side_hits_adjoint(
     planes: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
-    before: wp.vec4,
+    part_coverage: wp.vec4,
     hit_count: int,
     receiver: PlaneReceiver,
     hits: wp.array(dtype=PlaneHit),
@@ -329,14 +330,14 @@ def find_side_hits_adjoint(
     instance: int,
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
-    """Add to gradients of local receivers, viewed edges, and an instance's texels; return that of ``before``."""
-    adj_before = wp.vec4()
+    """Add to gradients of local receivers, viewed edges, and an instance's texels; return that of ``part_coverage``."""
+    adj_part_coverage = wp.vec4()
     for i in range(receiver.side_count):
         if is_hit(hits, i):
             side = load_side(planes, receiver, i)
             if _is_sender(side):
-                adj_before += _visible_radiosity_adjoint(
-                    planes, cell, texels, before, side, receiver, hits, adj_hits, instance, adj_texels
+                adj_part_coverage += _visible_radiosity_adjoint(
+                    planes, cell, texels, part_coverage, side, receiver, hits, adj_hits, instance, adj_texels
                 )
     if hit_count > 1:
         for k in range(1, receiver.side_count):
@@ -347,7 +348,7 @@ def find_side_hits_adjoint(
         if is_hit(hits, i):
             side = load_side(planes, receiver, i)
             _outline_hit_adjoint(planes, cell, side, hit_count == 1, receiver, hits[i], adj_hits[i])
-    return adj_before
+    return adj_part_coverage
 
 
 @wp.func
@@ -355,7 +356,7 @@ def _visible_radiosity_adjoint(
     planes: PlaneArrays,
     cell: VisibleCell,
     texels: wp.array(dtype=wp.vec3),
-    before: wp.vec4,
+    part_coverage: wp.vec4,
     side: PlaneSide,
     receiver: PlaneReceiver,
     hits: wp.array(dtype=PlaneHit),
@@ -363,16 +364,16 @@ def _visible_radiosity_adjoint(
     instance: int,
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
-    """Add to the gradients of a local receiver, of a side's open part, and of its texels; return that of ``before``."""
-    adj_before = wp.vec4()
+    """Add to the gradients of a local receiver, of a side's open part, and of its texels; return that of the parts."""
+    adj_part_coverage = wp.vec4()
     hit, adj_radiosity = hits[side.index], adj_hits[side.index].radiosity
-    direction = _visible_direction(cell, hit, before)
+    direction = _visible_direction(cell, hit, part_coverage)
     adj_mip = fetch_adjoint(texels, side.grid, planes, _first_level(side), hit.footprint, hit.mip, adj_radiosity)
     if adj_texels:
         scatter(adj_texels[instance], planes, _first_level(side), hit.mip, adj_radiosity)
     adj_direction = footprint_on_side_adjoint(planes, side, direction, hit.footprint, adj_mip, receiver.sides)
-    if not _is_wholly_open(hit, before):
-        open_share, blocked_moment = _open_part(hit, before)
+    if not _is_wholly_open(hit, part_coverage):
+        open_share, blocked_moment = _open_part(hit, part_coverage)
         visible_direction, length = _unnormalized_direction(cell, open_share, blocked_moment)
         adj_centroid = (cell.radius / wp.length(visible_direction)) * (
             adj_direction - wp.dot(adj_direction, direction) * direction
@@ -382,9 +383,9 @@ def _visible_radiosity_adjoint(
         if open_share > _MIN_OPEN:
             adj_open = 0.5 * adj_mip[2] / open_share + adj_length * open_share / length
         adj_moment = (adj_length * blocked_moment - adj_centroid) / length
-        adj_before = wp.vec4(-adj_open * hit.open_share, adj_moment[0], adj_moment[1], adj_moment[2])
-        _add_to_open_part(adj_hits, side.index, adj_open * (1.0 - before[0]), adj_moment)
-    return adj_before
+        adj_part_coverage = wp.vec4(-adj_open * hit.open_share, adj_moment[0], adj_moment[1], adj_moment[2])
+        _add_to_open_part(adj_hits, side.index, adj_open * (1.0 - part_coverage[0]), adj_moment)
+    return adj_part_coverage
 
 
 @wp.func

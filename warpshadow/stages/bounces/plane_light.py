@@ -69,13 +69,13 @@ def _light_receivers(
     texel_radiosity = texels[instance_in(batch, texels.shape[0])]
     normal = normals[batch, index]
     total = wp.vec3()
-    before = wp.vec4()
+    part_coverage = wp.vec4()
     for q in range(directions.shape[0]):
         weight = wp.dot(normal, directions[q]) * transmittance[batch, index, q]
         if coverages:
-            before = coverages[batch, index, q]
+            part_coverage = coverages[batch, index, q]
         cell = visible_cell(inputs.planes, normal, directions[q])
-        if find_side_hits(inputs.planes, cell, texel_radiosity, weight, before, receiver, hits_of_cell) > 0:
+        if find_side_hits(inputs.planes, cell, texel_radiosity, weight, part_coverage, receiver, hits_of_cell) > 0:
             mean, _, total_coverage = mean_radiosity(receiver.side_count, hits_of_cell)
             total += (weight * wp.min(total_coverage, 1.0)) * mean
     light[batch, index] = light[batch, index] + (4.0 / float(directions.shape[0])) * total
@@ -120,7 +120,7 @@ def _light_receivers_adjoint(
     normal = normals[batch, index]
     adj_mean = (4.0 / float(directions.shape[0])) * adj_light[batch, index]
     adj_normal = wp.vec3()
-    before = wp.vec4()
+    part_coverage = wp.vec4()
     for q in range(directions.shape[0]):
         direction = directions[q]
         cosine = wp.dot(normal, direction)
@@ -128,8 +128,8 @@ def _light_receivers_adjoint(
         weight = cosine * cell_transmittance
         cell = visible_cell(inputs.planes, normal, direction)
         if coverages:
-            before = coverages[batch, index, q]
-        hit_count = find_side_hits(inputs.planes, cell, texel_radiosity, cosine, before, receiver, hits_of_cell)
+            part_coverage = coverages[batch, index, q]
+        hit_count = find_side_hits(inputs.planes, cell, texel_radiosity, cosine, part_coverage, receiver, hits_of_cell)
         if hit_count > 0:
             mean, weights, total_coverage = mean_radiosity(receiver.side_count, hits_of_cell)
             value = wp.dot(adj_mean, mean)
@@ -149,11 +149,11 @@ def _light_receivers_adjoint(
             if adj_transmittance:
                 adj_transmittance[batch, index, q] = adj_transmittance[batch, index, q] + cosine * total
             if cell_transmittance > 0.0:
-                adj_before = find_side_hits_adjoint(
+                adj_part_coverage = find_side_hits_adjoint(
                     inputs.planes,
                     cell,
                     texel_radiosity,
-                    before,
+                    part_coverage,
                     hit_count,
                     receiver,
                     hits_of_cell,
@@ -161,8 +161,8 @@ def _light_receivers_adjoint(
                     texel_batch,
                     adj_texels,
                 )
-                if adj_coverages and before[0] > 0.0:
-                    adj_coverages[batch, index, q] = adj_coverages[batch, index, q] + adj_before
+                if adj_coverages and part_coverage[0] > 0.0:
+                    adj_coverages[batch, index, q] = adj_coverages[batch, index, q] + adj_part_coverage
     if adj_normals:
         adj_normals[batch, index] = adj_normals[batch, index] + adj_normal
     prepare_receiver_adjoint(receiver, inputs, adj_points, adj_front_weights, adj_frames)

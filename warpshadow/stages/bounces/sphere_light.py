@@ -24,7 +24,7 @@ from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, span_count, vectors_type
 from warpshadow.device.launch import launch_with_adjoint, varies
 from warpshadow.device.memory import empty
-from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_slot
+from warpshadow.device.parallel import Scratch, run_dimensions, scratch_slot, split_launch
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.bounces.proxy_weights import WeightInputs, make_weight_functions
 from warpshadow.stages.bounces.tangent_planes import TangentPlanes
@@ -67,7 +67,7 @@ def _task_type(lanes: int) -> Any:
     class LightTask:
         cells: DirectionCells
         first_bundle: int
-        ends: wp.array(dtype=wp.int32)  # [bundle] 0 where nothing is blocked, else the traversal's end
+        stops: wp.array(dtype=wp.int32)  # [bundle] 0 where nothing is blocked, else the traversal's end
         reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a cluster, may reach
         blocked: wp.array(dtype=Lane)  # [direction] F − T
         transmittance_others: wp.array(dtype=Lane)  # [direction] F, until F − T is loaded
@@ -144,7 +144,7 @@ def _make_load_task(lanes: int) -> wp.Function:
         task.cells = inputs.cells
         task.first_bundle = span * (scratch.shape[2] // BUNDLE)
         task.reached_bundles = reached_bundles[slot]
-        task.ends = reached_bundles[slot, 2]
+        task.stops = reached_bundles[slot, 2]
         task.blocked = scratch[slot, 0]
         task.factors = scratch[slot, 0]
         task.transmittance_others = scratch[slot, 1]
@@ -159,11 +159,11 @@ def _make_load_task(lanes: int) -> wp.Function:
         for run in range(spheres.run_bounds.shape[1]):
             largest_radius = wp.max(largest_radius, spheres.run_bounds[batch, run][3])
         task.weights.inverse_size = 1.0 / largest_radius
-        for bundle in range(task.ends.shape[0]):
-            task.ends[bundle] = 0
+        for bundle in range(task.stops.shape[0]):
+            task.stops[bundle] = 0
             is_above = is_bundle_above(task.cells, task.first_bundle + bundle, receivers.normals)
             if is_above and load_blocked(batch, block, bundle, inputs, task):
-                task.ends[bundle] = spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
+                task.stops[bundle] = spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
         return batch, block, receivers, task
 
     return load_task
@@ -231,16 +231,16 @@ def _make_light(lanes: int) -> wp.Kernel:
     ):
         """A thread owns a block of receivers and a span of bundles, and adds to the light."""
         i, j = wp.tid()
-        span, row = find_run(worker, first_row + i, j)
+        span, row = split_launch(worker, first_row + i, j)
         batch, block, receivers, task = load_task(row, span, worker, inputs, scratch, reached_bundles, sums)
-        for bundle in range(task.ends.shape[0]):
-            if task.ends[bundle] > 0:
+        for bundle in range(task.stops.shape[0]):
+            if task.stops[bundle] > 0:
                 for k in range(BUNDLE * SUMS):
                     task.sums[bundle * BUNDLE * SUMS + k] = Lane(0.0)
         traverse(receivers, batch, inputs.traversed.spheres, Gradients(), task)
         light_sum = Vectors()
-        for bundle in range(task.ends.shape[0]):
-            if task.ends[bundle] > 0:
+        for bundle in range(task.stops.shape[0]):
+            if task.stops[bundle] > 0:
                 for i in range(BUNDLE):
                     slot = bundle * BUNDLE + i
                     omega = task.cells.directions[(task.first_bundle + bundle) * BUNDLE + i]
@@ -357,7 +357,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         T̄ = −4/Q max(n·ω, 0) Ī·R = −F̄,  n̄ = 4/Q Σ ω (F − T) Ī·R where n·ω > 0
         """
         i, j = wp.tid()
-        span, row = find_run(worker, first_row + i, j)
+        span, row = split_launch(worker, first_row + i, j)
         batch, block, receivers, task = load_task(row, span, worker, inputs, scratch, reached_bundles, sums)
         task.adj_light = load(adj_light[batch], block)
         if adj_radiance:
@@ -365,8 +365,8 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         if adj_equations:
             task.weights.adj_equations = adj_equations[instance_in(batch, adj_equations.shape[0])]
         adj_normal = Vectors()
-        for bundle in range(task.ends.shape[0]):
-            if task.ends[bundle] > 0:
+        for bundle in range(task.stops.shape[0]):
+            if task.stops[bundle] > 0:
                 adj_normal = add(adj_normal, bundle_adjoint(receivers, bundle, inputs.factor, task))
                 first_slot = bundle * BUNDLE
                 first_direction = (task.first_bundle + bundle) * BUNDLE

@@ -7,7 +7,7 @@ from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, reshaped
-from warpshadow.device.parallel import find_run, run_dimensions, run_length
+from warpshadow.device.parallel import run_dimensions, run_length, split_launch
 from warpshadow.stages.emitters.samples import PlacedSamples
 from warpshadow.stages.emitters.spot_cones import beam_share
 from warpshadow.stages.raster.interpolation import interpolate_at
@@ -39,7 +39,7 @@ def _show_beams(
 ):
     """A thread owns a run of samples of an instance."""
     row, column = wp.tid()
-    batch, thread = find_run(worker, first_row + row, column)
+    batch, thread = split_launch(worker, first_row + row, column)
     fragment_batch = instance_in(batch, face_ids.shape[0])
     body_batch = instance_in(batch, positions.shape[0])
     eye = eye_position(clip_matrices[instance_in(batch, clip_matrices.shape[0])])

@@ -9,7 +9,7 @@ light E, metallic m, specular s and F₀ = 0.04, a surface of albedo a reflects 
 
 R is the same in all directions that are blocked: their mean by the cosine, which bounced light tells. In stills it is
 a ratio of two sums over the same rays, of which most noise cancels.
-E' is diffuse light times (1 − v·h)⁵: of even light it is E e(μ), which is taken for all light.
+E' is diffuse light times (1 − v·h)⁵. We take E e(μ) for it, which is exact under an even sky.
 """
 
 import functools

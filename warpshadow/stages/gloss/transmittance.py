@@ -75,27 +75,27 @@ def _interpolate_cells(
     batch, receiver = split_row(item, means.shape[1])
     normal = normals[batch, receiver]
     slot = scratch_slot(worker, item)
-    through = scratch[slot, 0]
-    above = scratch[slot, 1]
+    capped_transmittance = scratch[slot, 0]
+    horizon_weights = scratch[slot, 1]
     for chunk in range(cells.shape[1]):
         heights = _heights(normal, cells[0, chunk], cells[1, chunk], cells[2, chunk], per_radius)
-        above[chunk] = _horizon_weights(heights)
-        through[chunk] = wp.min(transmittance[batch, receiver, chunk], above[chunk])
+        horizon_weights[chunk] = _horizon_weights(heights)
+        capped_transmittance[chunk] = wp.min(transmittance[batch, receiver, chunk], horizon_weights[chunk])
     for i in range(means.shape[2]):
         direction = directions[batch, receiver, i]
         texel = texel_of(direction)
-        through_sums = Chunk(0.0)
-        above_sums = Chunk(0.0)
+        transmittance_sums = Chunk(0.0)
+        horizon_sums = Chunk(0.0)
         for k in range(neighbors.shape[1]):
             chunk = neighbors[texel, k]
             if chunk < 0:
                 break
             kernel = _kernels(direction, cells[0, chunk], cells[1, chunk], cells[2, chunk], reach_cosine)
             weight = wp.cw_mul(kernel, kernel) + Chunk(_MIN_KERNEL)
-            through_sums += wp.cw_mul(weight, through[chunk])
-            above_sums += wp.cw_mul(weight, above[chunk])
-        weights[batch, receiver, i] = total_of_chunk(above_sums)
-        means[batch, receiver, i] = total_of_chunk(through_sums) / weights[batch, receiver, i]
+            transmittance_sums += wp.cw_mul(weight, capped_transmittance[chunk])
+            horizon_sums += wp.cw_mul(weight, horizon_weights[chunk])
+        weights[batch, receiver, i] = total_of_chunk(horizon_sums)
+        means[batch, receiver, i] = total_of_chunk(transmittance_sums) / weights[batch, receiver, i]
 
 
 @wp.kernel(enable_backward=False)
@@ -125,21 +125,21 @@ def _interpolate_cells_adjoint(
     batch, receiver = split_row(item, means.shape[1])
     normal = normals[batch, receiver]
     slot = scratch_slot(worker, item)
-    through = scratch[slot, 0]
-    above = scratch[slot, 1]
-    adj_through_cells = scratch[slot, 2]
-    adj_above_cells = scratch[slot, 3]
+    capped_transmittance = scratch[slot, 0]
+    horizon_weights = scratch[slot, 1]
+    adj_capped_cells = scratch[slot, 2]
+    adj_horizon_cells = scratch[slot, 3]
     for chunk in range(cells.shape[1]):
         heights = _heights(normal, cells[0, chunk], cells[1, chunk], cells[2, chunk], per_radius)
-        above[chunk] = _horizon_weights(heights)
-        through[chunk] = wp.min(transmittance[batch, receiver, chunk], above[chunk])
-        adj_through_cells[chunk] = Chunk(0.0)
-        adj_above_cells[chunk] = Chunk(0.0)
+        horizon_weights[chunk] = _horizon_weights(heights)
+        capped_transmittance[chunk] = wp.min(transmittance[batch, receiver, chunk], horizon_weights[chunk])
+        adj_capped_cells[chunk] = Chunk(0.0)
+        adj_horizon_cells[chunk] = Chunk(0.0)
     for i in range(means.shape[2]):
         direction = directions[batch, receiver, i]
         texel = texel_of(direction)
-        adj_through = adj_means[batch, receiver, i] / weights[batch, receiver, i]
-        adj_above = -means[batch, receiver, i] * adj_through
+        adj_capped = adj_means[batch, receiver, i] / weights[batch, receiver, i]
+        adj_weight_sum = -means[batch, receiver, i] * adj_capped
         adj_x = Chunk(0.0)
         adj_y = Chunk(0.0)
         adj_z = Chunk(0.0)
@@ -152,13 +152,13 @@ def _interpolate_cells_adjoint(
             z = cells[2, chunk]
             kernel = _kernels(direction, x, y, z, reach_cosine)
             weight = wp.cw_mul(kernel, kernel) + Chunk(_MIN_KERNEL)
-            adj_weight = adj_through * through[chunk] + adj_above * above[chunk]
+            adj_weight = adj_capped * capped_transmittance[chunk] + adj_weight_sum * horizon_weights[chunk]
             adj_kernel = 2.0 * wp.cw_mul(kernel, adj_weight)
             adj_x += wp.cw_mul(adj_kernel, x)
             adj_y += wp.cw_mul(adj_kernel, y)
             adj_z += wp.cw_mul(adj_kernel, z)
-            adj_through_cells[chunk] = adj_through_cells[chunk] + adj_through * weight
-            adj_above_cells[chunk] = adj_above_cells[chunk] + adj_above * weight
+            adj_capped_cells[chunk] = adj_capped_cells[chunk] + adj_capped * weight
+            adj_horizon_cells[chunk] = adj_horizon_cells[chunk] + adj_weight_sum * weight
         if adj_directions:
             adj_direction = wp.vec3(total_of_chunk(adj_x), total_of_chunk(adj_y), total_of_chunk(adj_z))
             adj_directions[batch, receiver, i] = adj_directions[batch, receiver, i] + adj_direction
@@ -167,13 +167,13 @@ def _interpolate_cells_adjoint(
         x = cells[0, chunk]
         y = cells[1, chunk]
         z = cells[2, chunk]
-        is_blocked = is_positive_in_chunk(above[chunk] - through[chunk])
-        adj_blocked = wp.cw_mul(is_blocked, adj_through_cells[chunk])
+        is_blocked = is_positive_in_chunk(horizon_weights[chunk] - capped_transmittance[chunk])
+        adj_blocked = wp.cw_mul(is_blocked, adj_capped_cells[chunk])
         if adj_transmittance:
             adj_transmittance[batch, receiver, chunk] = adj_transmittance[batch, receiver, chunk] + adj_blocked
         if adj_normals:
             t = _heights(normal, x, y, z, per_radius)
-            adj_heights = adj_above_cells[chunk] + adj_through_cells[chunk] - adj_blocked
+            adj_heights = adj_horizon_cells[chunk] + adj_capped_cells[chunk] - adj_blocked
             adj_cosines = 3.0 * per_radius * wp.cw_mul(wp.cw_mul(t, Chunk(1.0) - t), adj_heights)
             adj_normal += wp.vec3(wp.dot(adj_cosines, x), wp.dot(adj_cosines, y), wp.dot(adj_cosines, z))
     if adj_normals:

@@ -6,7 +6,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, reshaped
-from warpshadow.device.parallel import find_run, run_dimensions, run_length
+from warpshadow.device.parallel import run_dimensions, run_length, split_launch
 from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.raster.rasterization import Fragments
 
@@ -30,7 +30,7 @@ def _sample_radiance(
 ):
     """A thread owns a run of samples of an instance."""
     row, column = wp.tid()
-    batch, thread = find_run(worker, first_row + row, column)
+    batch, thread = split_launch(worker, first_row + row, column)
     fragment_batch = instance_in(batch, face_ids.shape[0])
     receiver_shading = shading[instance_in(batch, shading.shape[0])]
     sample_albedo = albedo[instance_in(batch, albedo.shape[0])]

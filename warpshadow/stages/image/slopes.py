@@ -56,6 +56,7 @@ from warpshadow.stages.raster.screen import (
     sample_center,
 )
 from warpshadow.stages.receivers.quadtree import Quadtree
+from warpshadow.stages.silhouettes.areas import LineArea
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import Silhouettes
 from warpshadow.stages.silhouettes.lines import (
@@ -119,7 +120,7 @@ def _distance_to_end(
 
 
 @wp.func
-def _let_follow(
+def _mark_mean_slope(
     fragments: FragmentArrays,
     entries: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
@@ -164,14 +165,14 @@ def _find_outline_samples(
         for k in range(4):
             is_at_outline = is_at_outline or _distance_to_end(fragments, entries, edges, sample, k) > 0.0
     if is_at_outline:
-        _let_follow(fragments, entries, edges, sides, keys, has_mean_slope, sample)
+        _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, sample)
         for k in range(4):
             on_path = sample
             steps = int(0)
             while steps < reach and _distance_to_end(fragments, entries, edges, on_path, k) == -1.0:
                 on_path = neighbor(on_path, k, fragments.width)
                 steps += 1
-                _let_follow(fragments, entries, edges, sides, keys, has_mean_slope, on_path)
+                _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, on_path)
                 for turn in range(2):
                     direction = wp.where(k < 2, 2, 0) + turn
                     end = on_path
@@ -179,7 +180,7 @@ def _find_outline_samples(
                     while further_steps < reach and _distance_to_end(fragments, entries, edges, end, direction) == -1.0:
                         end = neighbor(end, direction, fragments.width)
                         further_steps += 1
-                        _let_follow(fragments, entries, edges, sides, keys, has_mean_slope, end)
+                        _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, end)
 
 
 def find_outline_samples(
@@ -257,7 +258,7 @@ def _add_shading_gradients(
     fragments: FragmentArrays,
     entries: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
-    shares: wp.array2d(dtype=wp.vec3),
+    line_areas: wp.array2d(dtype=LineArea),
     edge_colors: wp.array3d(dtype=wp.vec4),
     has_mean_slope: wp.array2d(dtype=wp.bool),
     albedo_has_mean_slope: wp.array2d(dtype=wp.bool),
@@ -311,7 +312,9 @@ def _add_shading_gradients(
                 if not is_flat:
                     extents = wp.vec2(1.0, 1.0)
                     if entry >= 0:
-                        image_weight = wp.max(find_image_weight(fragment, entry, entries, shares, width), MIN_WEIGHT)
+                        image_weight = wp.max(
+                            find_image_weight(fragment, entry, entries, line_areas, width), MIN_WEIGHT
+                        )
                     for direction in range(4):
                         edge = wp.vec2i(NOTHING, NOTHING)
                         if entry >= 0:
@@ -426,7 +429,7 @@ def moving_radiance(
                 make_fragment_arrays(silhouettes.fragments, silhouettes.faces, clip_positions),
                 silhouettes.entries,
                 silhouettes.edges,
-                silhouettes.shares,
+                silhouettes.line_areas,
                 edge_colors,
                 has_mean_slope,
                 albedo_has_mean_slope,

@@ -14,7 +14,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, reshaped
-from warpshadow.device.parallel import find_run, run_dimensions, run_length
+from warpshadow.device.parallel import run_dimensions, run_length, split_launch
 from warpshadow.device.warp_internals import scalar_type
 from warpshadow.stages.raster.rasterization import Fragments
 
@@ -76,7 +76,7 @@ def _make_interpolate(dtype: type) -> wp.Kernel:
     ):
         """A thread owns a run of samples of an instance."""
         row, column = wp.tid()
-        instance, thread = find_run(worker, first_row + row, column)
+        instance, thread = split_launch(worker, first_row + row, column)
         fragment_batch = instance_in(instance, face_ids.shape[0])
         instance_attributes = attributes[instance_in(instance, attributes.shape[0])]
         for sample in range(thread * run, (thread + 1) * run):

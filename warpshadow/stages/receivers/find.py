@@ -14,7 +14,7 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import launch, without_gradient
 from warpshadow.device.memory import empty, from_numpy, reshaped, zeros
-from warpshadow.device.parallel import find_run, run_dimensions, run_length
+from warpshadow.device.parallel import run_dimensions, run_length, split_launch
 from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.sides import split_side, split_sides
@@ -112,7 +112,7 @@ def _gather_points(
 ):
     """A thread owns a receiver: a vertex, or a fragment, −1 for nothing. Footprints of vertices are 0."""
     row, column = wp.tid()
-    batch, receiver = find_run(worker, first_row + row, column)
+    batch, receiver = split_launch(worker, first_row + row, column)
     position_batch = instance_in(batch, positions.shape[0])
     fragment = receiver - vertices.shape[0]
     footprint = wp.vec3()

@@ -347,12 +347,12 @@ def _multiply_chunks(
         products[batch, receiver, chunk] = wp.cw_mul(factors[batch, receiver, chunk], values[batch, receiver, chunk])
 
 
-def multiply_transmittances(transmittance_self: wp.array, transmittance_others: wp.array) -> wp.array:
+def multiply_transmittances(first: wp.array, second: wp.array) -> wp.array:
     """The product of two transmittances, float32 of shape [batch, receiver, direction]. Differentiable: both."""
-    use_vector_registers(__name__, transmittance_self.device)
-    product = empty(transmittance_self.shape, dtype=wp.float32, device=transmittance_self.device)
-    if transmittance_self.requires_grad or transmittance_others.requires_grad:
+    use_vector_registers(__name__, first.device)
+    product = empty(first.shape, dtype=wp.float32, device=first.device)
+    if first.requires_grad or second.requires_grad:
         require_gradient(product)  # before it is seen as chunks
-    inputs = [as_chunks(transmittance_self), as_chunks(transmittance_others)]
-    launch(_multiply_chunks, transmittance_self.shape[:2], inputs=inputs, outputs=[as_chunks(product)])
+    inputs = [as_chunks(first), as_chunks(second)]
+    launch(_multiply_chunks, first.shape[:2], inputs=inputs, outputs=[as_chunks(product)])
     return product

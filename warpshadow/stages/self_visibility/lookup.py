@@ -6,9 +6,12 @@ World direction ω is direction d = Rᵀω / |Rᵀω| of the body. It reads the 
 
 c_k the directions of rays or coarse cells, and S_k whether they are open. The weights are C¹ in R.
 
-h follows the light: mean squared angles are equated. Weights have h²/4; the table's cells already blur by ρ²/2, where
-ρ = 2/√C is the radius of one of C cells; an evenly bright cap of half-angle s has s²/2. So h² = 2 (s² − ρ²), and at
-least 2.2 ρ, so that something is always near: a cell with a sun looks at few rays, an even one at some 6 coarse cells.
+h follows the light, whose mean squared angle it matches: of the weights, h²/4, and the table's cells, ρ²/2, with the
+radius ρ = 2/√C of one of C cells, to that of an evenly bright cap of half-angle s, s²/2:
+
+    h²/4 + ρ²/2 = s²/2,  so  h² = 2 (s² − ρ²),  and h ≥ 2.2 ρ, so that something is always near.
+
+A cell with a sun looks at few rays, an even one at some 6 coarse cells.
 """
 
 from typing import NamedTuple

@@ -16,9 +16,10 @@ column, with 1 in place of ω:
 
     dx = α da_x + β db_x, on screen         α, β: the point on the edge is α a + β b in clip space, scaled to w = 1
 
-Between two neighbors of which one sees the surface there is an odd number of edges. One of them is found; the others
-cancel in pairs, since they move alike. (By the edge's normal they would not: along a border with teeth of a sample
-gradients had the wrong sign.)
+Between two neighbors of which one sees the surface there is an odd number of edges, and the image changes by Σ ± dx,
+with alternating signs. One of them is found. The others come in pairs, an entry and an exit within a sample: where a
+body moves as a whole, both have the same dx along the row, and cancel. (By the edge's normal they would not: along a
+border with teeth of a sample gradients had the wrong sign.)
 
 **Intersections** have no points that move with the line, so they count by its normal, with ω:
 
@@ -51,6 +52,15 @@ from warpshadow.stages.silhouettes.lines import (
 wp.set_module_options({"max_unroll": 1})  # loops that are not unrolled compile faster, and run as fast
 
 
+@wp.struct
+class LineArea:
+    """The area that lies beyond a line; all are 0 where there is no line."""
+
+    area: float  # e, of the sample
+    weight: float  # ω, of the line
+    is_surface_end: float  # 1 where a surface ends at the line, 0 where it has a crease
+
+
 @wp.func
 def _area_beyond(distance: float, slope: float):
     """The area e, given t and m."""
@@ -65,11 +75,8 @@ def _area_beyond(distance: float, slope: float):
 
 @wp.func
 def measure_area(fragments: FragmentArrays, sample: int, direction: int, edge: wp.vec2i, neighbor_edge: wp.vec2i):
-    """Area e beyond the line in a direction, its weight ω, and whether a surface ends there, 1, or has a crease, 0.
-
-    At a crease the neighbor has the edge of another face. All are 0 where there is no line.
-    """
-    area_and_weight = wp.vec3()
+    """The area beyond the line in a direction. At a crease the neighbor has the edge of another face."""
+    line_area = LineArea()
     if edge[0] != NOTHING:
         samples_per_unit = half_size(fragments.width, fragments.height)
         line = line_between(fragments, sample, direction, edge)
@@ -78,9 +85,10 @@ def measure_area(fragments: FragmentArrays, sample: int, direction: int, edge: w
         area = _area_beyond(distance, wp.min(slope, 1.0))
         if wp.isfinite(line / line[direction / 2]):  # else vertices are so far away that products overflow
             is_surface_end = edge[0] == neighbor_edge[0] and edge[1] == neighbor_edge[1]
-            line_weight = 1.0 / (1.0 + slope * slope * slope * slope)
-            area_and_weight = wp.vec3(area, line_weight, wp.where(is_surface_end, 1.0, 0.0))
-    return area_and_weight
+            line_area.area = area
+            line_area.weight = 1.0 / (1.0 + slope * slope * slope * slope)
+            line_area.is_surface_end = wp.where(is_surface_end, 1.0, 0.0)
+    return line_area
 
 
 @wp.func

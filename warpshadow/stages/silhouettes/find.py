@@ -24,7 +24,7 @@ from warpshadow.stages.raster.screen import (
     orientation,
     sample_center,
 )
-from warpshadow.stages.silhouettes.areas import measure_area
+from warpshadow.stages.silhouettes.areas import LineArea, measure_area
 from warpshadow.stages.silhouettes.edges import SNAP, edge_of_crossing, find_half_edge, is_crease, is_silhouette
 from warpshadow.stages.silhouettes.lines import (
     INTERSECTION,
@@ -61,15 +61,14 @@ class Silhouettes:
         edges: Vertices a, b of the edge between it and its neighbor to the right, left, below and above, in the order
             in which the line a × b is positive on its surface; (−1, −1) where there is none, (−2, −2) where their
             faces intersect; vec2i of shape [entry, 4]. At a crease each of the two has the vertices of its own side.
-        shares: The area e of the sample that lies beyond each, its weight ω, and whether a surface ends
-            there, 1, or has a crease, 0; vec3 of shape [entry, 4].
+        line_areas: The area of the sample that lies beyond each, :class:`.LineArea` of shape [entry, 4].
         entries: Entry of each sample of the flat images, −1 for none, int32 of shape [sample].
         faces: The rasterized faces, vec3i of shape [face].
     """
 
     samples: wp.array
     edges: wp.array
-    shares: wp.array
+    line_areas: wp.array
     entries: wp.array
     fragments: Fragments
     faces: wp.array
@@ -265,7 +264,7 @@ def _make_entries(
     # out
     samples: wp.array(dtype=wp.int32),
     edges: wp.array2d(dtype=wp.vec2i),
-    shares: wp.array2d(dtype=wp.vec3),
+    line_areas: wp.array2d(dtype=LineArea),
     entries: wp.array(dtype=wp.int32),
 ):
     """A thread owns ``run`` samples after one another, whose entries begin where the run before ends.
@@ -297,7 +296,7 @@ def _make_entries(
                         fragments, neighbors, creases, crossings, crossing_sample, 2 * axis, is_before
                     )
                 edges[entry, direction] = edge
-                shares[entry, direction] = measure_area(fragments, sample, direction, edge, neighbor_edge)
+                line_areas[entry, direction] = measure_area(fragments, sample, direction, edge, neighbor_edge)
             entries[sample] = wp.where(entry_number >= 0, entry, -1)
 
 
@@ -359,7 +358,7 @@ def find_silhouettes(
         wp.utils.array_scan(ends, ends)
         entry_count = int(ends[-1:].numpy()[0]) if thread_count else 0
     samples = empty(entry_count, wp.int32, device)
-    edges, shares = (empty((entry_count, 4), dtype, device) for dtype in (wp.vec2i, wp.vec3))
-    inputs, outputs = [crossings, arrays, neighbors, creases, ends, run], [samples, edges, shares, entries]
+    edges, line_areas = (empty((entry_count, 4), dtype, device) for dtype in (wp.vec2i, LineArea))
+    inputs, outputs = [crossings, arrays, neighbors, creases, ends, run], [samples, edges, line_areas, entries]
     launch(_make_entries, thread_count, cost=_ENTRY_COST * run, inputs=inputs, outputs=outputs)
-    return Silhouettes(samples, edges, shares, entries, fragments, faces)
+    return Silhouettes(samples, edges, line_areas, entries, fragments, faces)

@@ -23,39 +23,40 @@ from warpshadow.device.memory import copied, reshaped
 from warpshadow.device.warp_internals import scalar_type
 from warpshadow.stages.raster.interpolation import inner_product
 from warpshadow.stages.raster.screen import neighbor, opposite
-from warpshadow.stages.silhouettes.areas import measure_area_adjoint
+from warpshadow.stages.silhouettes.areas import LineArea, measure_area_adjoint
 from warpshadow.stages.silhouettes.find import Silhouettes
 from warpshadow.stages.silhouettes.lines import INTERSECTION, FragmentArrays, make_fragment_arrays
 
 
 @wp.func
-def _overlap_loss(share: wp.vec3, neighbor_share: wp.vec3):
+def _overlap_loss(line: LineArea, other: LineArea):
     """Loss of an area to one beyond a neighboring line, as a fraction of their product."""
-    loss_share = 0.5 * (1.0 + neighbor_share[2] - share[2])
-    return loss_share * wp.max(share[1] + neighbor_share[1] - 1.0, 0.0)
+    loss_share = 0.5 * (1.0 + other.is_surface_end - line.is_surface_end)
+    return loss_share * wp.max(line.weight + other.weight - 1.0, 0.0)
 
 
 @wp.func
-def _area_weight(shares: wp.array(dtype=wp.vec3), direction: int):
+def _area_weight(lines: wp.array(dtype=LineArea), direction: int):
     """Weight of the area in a direction: ω, less its loss to the areas in both directions across."""
     perpendicular = wp.where(direction < 2, 2, 0)
-    weight = shares[direction][1] - _overlap_loss(shares[direction], shares[perpendicular]) * shares[perpendicular][0]
-    return weight - _overlap_loss(shares[direction], shares[perpendicular + 1]) * shares[perpendicular + 1][0]
+    line, first, second = lines[direction], lines[perpendicular], lines[perpendicular + 1]
+    weight = line.weight - _overlap_loss(line, first) * first.area
+    return weight - _overlap_loss(line, second) * second.area
 
 
 @wp.func
 def find_image_weight(
-    sample: int, entry: int, entries: wp.array(dtype=wp.int32), shares: wp.array2d(dtype=wp.vec3), width: int
+    sample: int, entry: int, entries: wp.array(dtype=wp.int32), line_areas: wp.array2d(dtype=LineArea), width: int
 ):
     """Weight of a sample that has an entry in all of the smoothed image: of its own color, and in its neighbors'."""
     weight = float(1.0)
     for direction in range(4):
-        share = shares[entry, direction]
-        if share[1] > 0.0:
+        line = line_areas[entry, direction]
+        if line.weight > 0.0:
             other_entry = entries[neighbor(sample, direction, width)]
             back = opposite(direction)
-            weight -= share[0] * _area_weight(shares[entry], direction)
-            weight += shares[other_entry, back][0] * _area_weight(shares[other_entry], back)
+            weight -= line.area * _area_weight(line_areas[entry], direction)
+            weight += line_areas[other_entry, back].area * _area_weight(line_areas[other_entry], back)
     return weight
 
 
@@ -68,7 +69,7 @@ def _make_blend(dtype: type) -> wp.Kernel:
         # in
         image: wp.array2d(dtype=dtype),
         samples: wp.array(dtype=wp.int32),
-        shares: wp.array2d(dtype=wp.vec3),
+        line_areas: wp.array2d(dtype=LineArea),
         width: int,
         # out
         smoothed: wp.array2d(dtype=dtype),
@@ -77,14 +78,14 @@ def _make_blend(dtype: type) -> wp.Kernel:
         instance, entry = wp.tid()
         sample = samples[entry]
         if sample >= 0:
-            sample_shares = shares[entry]
+            lines = line_areas[entry]
             color = image[instance, sample]
             blended = color
             for direction in range(4):
-                area = sample_shares[direction][0]
+                area = lines[direction].area
                 if area > 0.0:
                     contrast = image[instance, neighbor(sample, direction, width)] - color
-                    blended += area * _area_weight(sample_shares, direction) * contrast
+                    blended += area * _area_weight(lines, direction) * contrast
             smoothed[instance, sample] = blended
 
     return blend
@@ -99,7 +100,7 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
         # in
         image: wp.array2d(dtype=dtype),
         samples: wp.array(dtype=wp.int32),
-        shares: wp.array2d(dtype=wp.vec3),
+        line_areas: wp.array2d(dtype=LineArea),
         fragments: FragmentArrays,
         entries: wp.array(dtype=wp.int32),
         edges: wp.array2d(dtype=wp.vec2i),
@@ -117,18 +118,18 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
         entry = wp.tid()
         sample = samples[entry]
         if sample >= 0:
-            sample_shares = shares[entry]
+            lines = line_areas[entry]
             for direction in range(4):
-                share = sample_shares[direction]
-                if share[0] > 0.0:
+                line = lines[direction]
+                if line.area > 0.0:
                     other = neighbor(sample, direction, fragments.width)
-                    weight = _area_weight(sample_shares, direction)
+                    weight = _area_weight(lines, direction)
                     adj_area = float(0.0)
                     for instance in range(image.shape[0]):
                         adj = adj_smoothed[instance, sample]
                         if adj_image:
-                            wp.atomic_add(adj_image, instance, other, share[0] * weight * adj)
-                            wp.atomic_sub(adj_image, instance, sample, share[0] * weight * adj)
+                            wp.atomic_add(adj_image, instance, other, line.area * weight * adj)
+                            wp.atomic_sub(adj_image, instance, sample, line.area * weight * adj)
                         contrast = image[instance, other] - image[instance, sample]
                         if edge_colors:
                             neighbor_color = edge_colors[instance, entries[other], opposite(direction)]
@@ -136,7 +137,7 @@ def _make_blend_adjoint(dtype: type) -> wp.Kernel:
                         adj_area += inner_product(adj, contrast)
                     if adj_clip_positions and adj_area != 0.0:
                         edge = edges[entry, direction]
-                        adj_area *= wp.where(edge[0] == INTERSECTION, share[1], 1.0)
+                        adj_area *= wp.where(edge[0] == INTERSECTION, line.weight, 1.0)
                         measure_area_adjoint(fragments, sample, direction, edge, adj_area, adj_clip_positions)
 
     return blend_adjoint
@@ -170,10 +171,10 @@ def smooth_silhouettes(
     check.shape("clip_positions", clip_positions.shape, (batch_count, "vertex"))
     if scalar_type(image.dtype) is not wp.float32:
         raise ValueError(f"image: got dtype {image.dtype.__name__}, expected float32 or a vector of them")
-    shape, samples, shares = silhouettes.flat_shape(image), silhouettes.samples, silhouettes.shares
+    shape, samples, line_areas = silhouettes.flat_shape(image), silhouettes.samples, silhouettes.line_areas
 
     def blend(smoothed: wp.array) -> None:
-        inputs = [reshaped(image, shape), samples, shares, width]
+        inputs = [reshaped(image, shape), samples, line_areas, width]
         outputs = [reshaped(smoothed, shape)]
         launch(_make_blend(image.dtype), (shape[0], samples.size), inputs=inputs, outputs=outputs)
 
@@ -187,7 +188,7 @@ def smooth_silhouettes(
         launch(
             _make_blend_adjoint(image.dtype),
             samples.size,
-            inputs=[reshaped(image, shape), samples, shares, arrays, *edge_inputs, adj_smoothed],
+            inputs=[reshaped(image, shape), samples, line_areas, arrays, *edge_inputs, adj_smoothed],
             outputs=[adj_image, clip_positions.grad],
         )
 

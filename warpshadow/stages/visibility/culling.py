@@ -22,7 +22,7 @@ BOUND_MARGIN = 1.001 + BLEND
 
 
 FOOTPRINT_SHARE = wp.constant(5.0 / 12.0)
-"""Squared half-width of a smoothstep over the area of a square, where a mean over the square has the same variance."""
+"""W² / f²: a smoothstep from −W to W has the variance W²/5, a mean over a square of side f has f²/12."""
 
 
 @wp.struct
@@ -79,7 +79,7 @@ class CapFunctions(NamedTuple):
     """Kernel functions on caps."""
 
     widen_cone: wp.Function  # cones by w: axis, cosine and sine of θ, d², receivers, cells → caps
-    spread: wp.Function  # by how much footprints add to sin²w at distances d from the edges of shadows: d², receivers
+    spread: wp.Function  # what footprints f² add to sin²w: W² / (d² + 2 W²), W² = f² 5/12; of d², receivers
     reaches_bundle: wp.Function  # whether a cap reaches a bundle for any receiver
     is_above_horizon: wp.Function  # whether a cap rises above the horizon of any receiver
     soft_edge: wp.Function  # direction, cap, 1/(hi−lo) → t in the falloff, and its smoothstep
@@ -167,7 +167,7 @@ def make_cull(has_horizon: bool, Task: type, lanes: int, has_footprints: bool = 
         Task: Struct that has
 
             - ``cells`` and ``first_bundle``: the thread's bundles begin there;
-            - ``ends`` [bundle], int32: the traversal index from which on no sphere matters to a bundle;
+            - ``stops`` [bundle], int32: the traversal index from which on no sphere matters to a bundle;
             - ``reached_bundles`` [2, bundle], int32: bundles that a run, and then a cluster, may reach, where they are
               listed.
 
@@ -196,13 +196,13 @@ def make_cull(has_horizon: bool, Task: type, lanes: int, has_footprints: bool = 
             if is_within or is_above_horizon(cap, receivers.normals):
                 candidate_count = candidates
                 if candidates == ALL_BUNDLES:
-                    candidate_count = task.ends.shape[0]
+                    candidate_count = task.stops.shape[0]
                 for k in range(candidate_count):
                     bundle = k
                     if candidates != ALL_BUNDLES:
                         bundle = task.reached_bundles[0, k]
                     direction_bundle = task.first_bundle + bundle
-                    is_candidate = task.ends[bundle] > traversal_index
+                    is_candidate = task.stops[bundle] > traversal_index
                     if is_candidate and (
                         is_within
                         or reaches_bundle(cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle])

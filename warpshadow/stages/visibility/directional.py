@@ -28,7 +28,7 @@ from warpshadow import check
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, span_count
 from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
-from warpshadow.device.parallel import Scratch, find_run, run_dimensions, scratch_slot
+from warpshadow.device.parallel import Scratch, run_dimensions, scratch_slot, split_launch
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.visibility.culling import (
     DirectionCells,
@@ -67,7 +67,7 @@ def _task_type(lanes: int) -> Any:
     class TransmittanceTask:
         cells: DirectionCells
         first_bundle: int
-        ends: wp.array(dtype=wp.int32)  # [bundle] the traversal index from which on nothing is left to block
+        stops: wp.array(dtype=wp.int32)  # [bundle] the traversal index from which on nothing is left to block
         reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a cluster, may reach
         transmittances: wp.array(dtype=Lane)  # [direction] transmittance; for the adjoint its product with its adjoint
 
@@ -88,7 +88,7 @@ def _make_load_task(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.F
         worker: int,
         inputs: TraversalInputs,
         cells: DirectionCells,
-        all_ends: wp.array3d(dtype=wp.int32),
+        all_stops: wp.array3d(dtype=wp.int32),
         scratch: wp.array2d(dtype=Lane),
         reached_bundles: wp.array3d(dtype=wp.int32),
     ):
@@ -98,9 +98,9 @@ def _make_load_task(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.F
             for direction in range(cells.directions.shape[0]):
                 receivers.footprints += wp.abs(dot_direction(cells.directions[direction], footprints))
             receivers.footprints = receivers.footprints / float(cells.directions.shape[0])
-        slot = scratch_slot(worker, row * all_ends.shape[1] + span)
-        ends = all_ends[row, span]
-        task = TransmittanceTask(cells, span * ends.shape[0], ends, reached_bundles[slot], scratch[slot])
+        slot = scratch_slot(worker, row * all_stops.shape[1] + span)
+        stops = all_stops[row, span]
+        task = TransmittanceTask(cells, span * stops.shape[0], stops, reached_bundles[slot], scratch[slot])
         return batch, block, receivers, task
 
     return load_task
@@ -153,11 +153,11 @@ def _make_transmit(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.Ke
             for k in range(count):
                 bundle = task.reached_bundles[1, k]
                 direction_bundle = task.first_bundle + bundle
-                is_candidate = task.ends[bundle] > sphere_view.traversal_index and reaches_bundle(
+                is_candidate = task.stops[bundle] > sphere_view.traversal_index and reaches_bundle(
                     cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]
                 )
                 if is_candidate and not attenuate(cap, slope, opacity, bundle, task):
-                    task.ends[bundle] = sphere_view.traversal_index + 1
+                    task.stops[bundle] = sphere_view.traversal_index + 1
 
     cull = make_cull(has_horizon, TransmittanceTask, lanes, has_footprints)
     traverse = make_traversal(cull, visit, TransmittanceTask, False, lanes)
@@ -173,21 +173,21 @@ def _make_transmit(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.Ke
         scratch: wp.array2d(dtype=Lane),
         reached_bundles: wp.array3d(dtype=wp.int32),
         # out
-        all_ends: wp.array3d(dtype=wp.int32),
+        all_stops: wp.array3d(dtype=wp.int32),
         transmittance: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a block of receivers and a span of bundles; ends are the spheres where it stopped looking."""
+        """A thread owns a block of receivers and a span of bundles; stops are the spheres where it stopped looking."""
         i, j = wp.tid()
-        span, row = find_run(worker, first_row + i, j)
-        batch, block, receivers, task = load_task(row, span, worker, inputs, cells, all_ends, scratch, reached_bundles)
-        for bundle in range(task.ends.shape[0]):
+        span, row = split_launch(worker, first_row + i, j)
+        batch, block, receivers, task = load_task(row, span, worker, inputs, cells, all_stops, scratch, reached_bundles)
+        for bundle in range(task.stops.shape[0]):
             for cell in range(BUNDLE):
                 task.transmittances[bundle * BUNDLE + cell] = Lane(1.0)
-            task.ends[bundle] = 0  # wholly below the horizon: the cosine is zero there
+            task.stops[bundle] = 0  # wholly below the horizon: the cosine is zero there
             if is_bundle_above(cells, task.first_bundle + bundle, receivers.normals):
-                task.ends[bundle] = inputs.spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
+                task.stops[bundle] = inputs.spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
         traverse(receivers, batch, inputs.spheres, Gradients(), task)
-        direction_count = task.ends.shape[0] * BUNDLE
+        direction_count = task.stops.shape[0] * BUNDLE
         store_columns(task.transmittances, 0, transmittance[batch], task.first_bundle * BUNDLE, direction_count, block)
 
     return transmit
@@ -232,7 +232,7 @@ def _make_transmit_adjoint(has_horizon: bool, has_footprints: bool, lanes: int) 
         # in
         inputs: TraversalInputs,
         cells: DirectionCells,
-        all_ends: wp.array3d(dtype=wp.int32),
+        all_stops: wp.array3d(dtype=wp.int32),
         transmittance: wp.array3d(dtype=wp.float32),
         adj_transmittance: wp.array3d(dtype=wp.float32),
         # scratch
@@ -247,9 +247,9 @@ def _make_transmit_adjoint(has_horizon: bool, has_footprints: bool, lanes: int) 
     ):
         """A thread owns a block of receivers and a span of bundles."""
         i, j = wp.tid()
-        span, row = find_run(worker, first_row + i, j)
-        batch, block, receivers, task = load_task(row, span, worker, inputs, cells, all_ends, scratch, reached_bundles)
-        first_direction, count = task.first_bundle * BUNDLE, task.ends.shape[0] * BUNDLE
+        span, row = split_launch(worker, first_row + i, j)
+        batch, block, receivers, task = load_task(row, span, worker, inputs, cells, all_stops, scratch, reached_bundles)
+        first_direction, count = task.first_bundle * BUNDLE, task.stops.shape[0] * BUNDLE
         load_columns(transmittance[batch], first_direction, count, block, 0.0, task.transmittances, 0)
         multiply_by_columns(adj_transmittance[batch], first_direction, count, block, task.transmittances, 0)
         adj_receivers = traverse(receivers, batch, inputs.spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
@@ -307,7 +307,7 @@ def transmittance(
     device, traits = points.device, (normals is not None, footprints is not None, lanes)
     spans = span_count(device, len(directions))
     bundle_count = len(directions) // (BUNDLE * spans)
-    ends = empty((row_count, spans, bundle_count), dtype=wp.int32, device=device)
+    stops = empty((row_count, spans, bundle_count), dtype=wp.int32, device=device)
     result = empty((*points.shape, len(directions)), dtype=wp.float32, device=device)
     return launch_with_adjoint(
         _make_transmit(*traits),
@@ -317,8 +317,8 @@ def transmittance(
         result=result,
         variables=[points],
         shared=nodes,
-        outputs=[ends],
-        adj_inputs=[ends, result],
+        outputs=[stops],
+        adj_inputs=[stops, result],
         scratch=[Scratch((bundle_count * BUNDLE,), lane_type(lanes)), Scratch((2, bundle_count), wp.int32)],
         cost=PAIR_COST * lanes * radii.shape[1] * bundle_count * BUNDLE,
     )

@@ -4,14 +4,18 @@ exp*(f) = e^{f0/√4π} exp*(f̂ / 2^p)^{2^p}            [Lyu et al. 2021, secti
 
 Squarings are *held* where they would explode (:mod:`.held_squares`).
 
-The number of squarings is *blended*, so that the value does not jump with p, the least with t = |f̂| / (2^p T) ≤ 1 (by
-some tenths of a percent, where finite differences of images would be wrong). For p > 0, t is in (½, 1]. From t = ½ on
-the base approximation q of f / 2^p is blended with the square of q of f / 2^{p+1},
+p is the least with t = |f̂| / (2^p T) ≤ 1. So that the value does not jump with p (by some tenths of a percent, where
+finite differences of images would be wrong), the number of squarings is *blended*. With q the base approximation and
+w = smoothstep((t − ½) / (BLEND_END − ½)), squared p times is
 
-    (1 − w) q(f / 2^p) + w q(f / 2^{p+1})²,    w = smoothstep((t − ½) / (BLEND_END − ½))
+| t | |
+| --- | --- |
+| below ½, where p = 0 | q(f / 2^p) |
+| ½ to BLEND_END | (1 − w) q(f / 2^p) + w q(f / 2^{p+1})² |
+| BLEND_END to 1 | q(f / 2^{p+1})² |
 
-and from t = BLEND_END on, w = 1. At t = 1, p + 1 squarings take over, at their t = ½ and w = 0, with the same value and
-a continuous derivative. It costs one product more.
+At t = 1, p + 1 squarings take over, at their t = ½ and w = 0, with the same value and a continuous derivative. It costs
+one product more.
 """
 
 import functools

@@ -103,7 +103,7 @@ def make_sphere_adjoint(lanes: int) -> wp.Function:
         slope: Lane,
         adj_opacity: Lane,
         sum_adj_t: Lane,
-        sum_t: Lane,
+        sum_adj_t_t: Lane,
         sum_omega: Vectors,
     ):
         adj_cosine, adj_sine2, adj_weight, adj_cos_width, adj_sin_width = falloff_adjoint(
@@ -112,8 +112,8 @@ def make_sphere_adjoint(lanes: int) -> wp.Function:
             low,
             cos_width,
             sin_width,
-            wp.cw_mul(slope, sum_t - sum_adj_t),  # type: ignore[operator]
-            -wp.cw_mul(slope, sum_t),
+            wp.cw_mul(slope, sum_adj_t_t - sum_adj_t),  # type: ignore[operator]
+            -wp.cw_mul(slope, sum_adj_t_t),
             adj_opacity,
         )
         adj_cone = Cone(scale(slope, sum_omega), adj_cosine, adj_sine2, wp.cw_mul(adj_weight, sphere_view.share))
@@ -184,7 +184,7 @@ def make_cap_adjoint(
         cells = task.cells
         is_any_blocked = bool(False)
         sum_adj_t = Lane(0.0)
-        sum_t = Lane(0.0)
+        sum_adj_t_t = Lane(0.0)
         sum_x = Lane(0.0)
         sum_y = Lane(0.0)
         sum_z = Lane(0.0)
@@ -192,7 +192,7 @@ def make_cap_adjoint(
         for k in range(count):
             bundle = task.reached_bundles[1, k]
             direction_bundle = task.first_bundle + bundle
-            if task.ends[bundle] > sphere_view.traversal_index and reaches_bundle(
+            if task.stops[bundle] > sphere_view.traversal_index and reaches_bundle(
                 cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]
             ):
                 for i in range(BUNDLE):
@@ -207,11 +207,11 @@ def make_cap_adjoint(
                         step_slope = wp.cw_mul(t, Lane(1.0) - t)
                         adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_share, opacity), step_slope)
                         sum_adj_t += adj_t
-                        sum_t += wp.cw_mul(adj_t, t)
+                        sum_adj_t_t += wp.cw_mul(adj_t, t)
                         sum_x += omega[0] * adj_t
                         sum_y += omega[1] * adj_t
                         sum_z += omega[2] * adj_t
-        return is_any_blocked, adj_opacity, sum_adj_t, sum_t, Vectors(sum_x, sum_y, sum_z)
+        return is_any_blocked, adj_opacity, sum_adj_t, sum_adj_t_t, Vectors(sum_x, sum_y, sum_z)
 
     @wp.func(inline=True)
     def cap_adjoint(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: Task):
@@ -225,7 +225,7 @@ def make_cap_adjoint(
         if is_above_horizon(cap, receivers.normals):
             slope, opacity = falloff(cone, sine, cap.cosine, cap.cos_width, cap.sin_width)
             weight = find_weight(sphere_view, task)
-            is_any_blocked, adj_opacity, sum_adj_t, sum_t, sum_omega = sum_over_cells(
+            is_any_blocked, adj_opacity, sum_adj_t, sum_adj_t_t, sum_omega = sum_over_cells(
                 sphere_view, cap, slope, opacity, weight, count, task
             )
             if is_any_blocked:
@@ -238,7 +238,7 @@ def make_cap_adjoint(
                     slope,
                     adj_opacity,
                     sum_adj_t,
-                    sum_t,
+                    sum_adj_t_t,
                     sum_omega,
                 )
                 if wp.static(has_footprints):

@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from warpshadow.maths.convex import find_convex_parts, is_panel
-from warpshadow.maths.shells import find_layer
+from warpshadow.maths.thin_walls import find_layer
 
 WALL = 0.08
 

@@ -1,4 +1,4 @@
-"""Shells: closed surfaces around a thin wall, such as mugs and bottles, and one layer of them, which blocks for both.
+"""Thin walls: closed surfaces around one, such as mugs and bottles, and one layer of them, which blocks for both.
 
 A wall's two layers are where most of a surface has its other side opposite: faces and their opposites are a signed
 graph, in which neighbors should be on one side and opposites on two. The vector of the least eigenvalue of its
