@@ -622,7 +622,7 @@ def test_a_line_search_may_look_beyond_the_gloss_that_there_is():
     columns = []
     for value in (0.0, 0.02):
         values = {"metallic[0]": {"value": torch.tensor([value])}}
-        columns.append(NormalMatrix(problem, result.setting, values).columns)
+        columns.append(NormalMatrix(problem, result.context, values).columns)
     assert np.linalg.norm(columns[0] - columns[1]) < 0.1 * np.linalg.norm(columns[1])
 
 

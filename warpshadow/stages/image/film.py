@@ -25,7 +25,6 @@ def _sample_radiance(
     albedo: wp.array2d(dtype=wp.vec3),
     run: int,
     # out
-    light: wp.array2d(dtype=wp.vec3),
     samples: wp.array2d(dtype=wp.vec4),
 ):
     """A thread owns a run of samples of an instance."""
@@ -40,17 +39,11 @@ def _sample_radiance(
             irradiance = interpolate_at(receiver_shading, faces[face], barycentrics[fragment_batch, sample])
             radiance = wp.cw_mul(irradiance, sample_albedo[sample])
             samples[batch, sample] = wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
-            if light:
-                light[batch, sample] = irradiance
         else:
             samples[batch, sample] = wp.vec4()
-            if light:
-                light[batch, sample] = wp.vec3()
 
 
-def sample_radiance(
-    fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.array, light: wp.array | None = None
-) -> wp.array:
+def sample_radiance(fragments: Fragments, faces: wp.array, shading: wp.array, albedo: wp.array) -> wp.array:
     """Multiply the light at the samples, interpolated from the receivers, with their reflectance.
 
     Where surfaces move, :func:`warpshadow.stages.image.slopes.moving_radiance` has the better gradient.
@@ -60,7 +53,6 @@ def sample_radiance(
         shading: Of the receivers, vec3 of shape [batch, receiver].
         albedo: Of the samples, vec3 of shape [batch, height, width].
             Any batch, that of the fragments included, may be 1 and then serves every instance.
-        light: Where to store the light at the samples, vec3 of shape [batch, sample]; None for nowhere.
     Returns:
         Linear RGB and coverage, 1 or 0, vec4 of shape [batch, height, width].
     Differentiable: shading, albedo, barycentrics of the fragments.
@@ -75,7 +67,7 @@ def sample_radiance(
         run_dimensions(shading.device, height * width // run, count),
         cost=_COST * run,
         inputs=[*fragments.rows, faces, shading, rows(albedo), run],
-        outputs=[light, samples],
+        outputs=[samples],
         shared=[shading],
     )
     return reshaped(samples, (count, height, width))

@@ -32,17 +32,18 @@ light times albedo, of which either factor moves or both do.
 | a second step near outlines, at a sun's highlight three samples wide | wrong sign | | |
 """
 
+import math
 from dataclasses import replace
 
 import warp as wp
 
-from warpshadow.device.batch import common_batch, instance_in, rows
+from warpshadow.device.batch import instance_in, rows
 from warpshadow.device.launch import differentiable, launch, without_gradient
-from warpshadow.device.memory import copied, empty, reshaped, zeros
+from warpshadow.device.memory import copied, reshaped, zeros
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import record_adjoint
 from warpshadow.stages.image.film import sample_radiance
-from warpshadow.stages.raster.interpolation import interpolate_values_adjoint, interpolate_weights_adjoint
+from warpshadow.stages.raster.interpolation import interpolate, interpolate_values_adjoint, interpolate_weights_adjoint
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.screen import (
     direction_sign,
@@ -403,25 +404,22 @@ def moving_radiance(
     the receivers' points. By albedo samples are moved where it has a mean slope.
     """
     fragments = replace(fragments, barycentrics=without_gradient(fragments.barycentrics))
-    light = None
-    if clip_positions.requires_grad:
-        count = common_batch({"fragments": fragments.face_ids, "shading": shading, "albedo": albedo})
-        light = empty((count, fragments.face_ids[0].size), dtype=wp.vec3, device=shading.device)
-    samples = sample_radiance(fragments, faces, shading, albedo, light)
+    samples = sample_radiance(fragments, faces, shading, albedo)
     edge_colors = find_edge_colors(samples, silhouettes, clip_positions, shading, receivers, albedo)
-    if light is None:
+    if not clip_positions.requires_grad:
         return samples, edge_colors
     samples.requires_grad = True
 
     def adjoint() -> None:
+        light = interpolate(fragments, faces, without_gradient(shading))
         run = run_length(samples.device, samples.shape[2])
         launch(
             _add_shading_gradients,
-            light.shape[1] // run,
+            math.prod(light.shape[1:]) // run,
             cost=_COST * run * samples.shape[0],
             inputs=[
                 rows(samples),
-                light,
+                rows(light),
                 rows(fragments.face_ids),
                 faces,
                 shading,
