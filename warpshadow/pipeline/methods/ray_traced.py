@@ -275,7 +275,7 @@ def _checked_points(points: wp.array) -> wp.array:
 
 
 def _batch_shape(points: wp.array, shells: np.ndarray) -> tuple[int, int]:
-    """Shape of results [batch, receiver] of points and shells, each of which may be one for all."""
+    """Shape of results, [batch, receiver], where points or shells may be one for all instances."""
     return max(len(points), len(shells)) if points.size else 0, points.shape[1]
 
 
