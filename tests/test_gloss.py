@@ -35,8 +35,8 @@ SUN = 0.06
 # Of metals that mirror each other: what they mirror is a constant of poses. Measured 22%, and 161% with outlines fixed.
 OF_METALS = 0.35
 
-# Of metals that mirror each other. As roughness turns samples, what these meet is a constant. Measured 11%, and 5% where
-# rays that leave below their face had light: they lose it at once as they turn.
+# Of metals that mirror each other. As roughness turns samples, what these meet is a constant. Measured 11%, and 5%
+# where rays that leave below their face had light: they lose it at once as they turn.
 METALS_SMOOTH = {"albedo": SMOOTH, "metallic": SMOOTH, "roughness": 0.15}
 
 # Of a highlight that is a sample off a limb. Measured 18%, and 52% with mean slopes up to one sample from outlines.

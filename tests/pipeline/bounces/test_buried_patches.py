@@ -27,9 +27,7 @@ def test_the_foot_of_a_wall_is_as_bright_as_by_paths(sun, monkeypatch):
     lowest = np.flatnonzero((renderer.body_ids()[0] == 0).all(axis=1))[-5:]
     found = renderer.render()[lowest, :, :3].mean()
     monkeypatch.setattr(
-        gathering,
-        "find_texels",
-        lambda b, weights, planes: find_texels(b, wp.full_like(weights, wp.vec3(1.0)), planes),
+        gathering, "find_texels", lambda b, weights, planes: find_texels(b, wp.full_like(weights, wp.vec3(1.0)), planes)
     )
     without = ws.Renderer(dataclasses.replace(scene, supersampling=1), progress=False).render()[lowest, :, :3].mean()
     paths = ws.Visibility("ray-traced", samples=2048)
