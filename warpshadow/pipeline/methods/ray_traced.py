@@ -274,9 +274,9 @@ def _checked_points(points: wp.array) -> wp.array:
     return points
 
 
-def _batch_shape(points: wp.array, shells: np.ndarray) -> tuple[int, int]:
+def _batch_shape(points: wp.array, shells: np.ndarray) -> tuple[int, ...]:
     """Shape of results, [batch, receiver], where points or shells may be one for all instances."""
-    return max(len(points), len(shells)) if points.size else 0, points.shape[1]
+    return (max(len(points), len(shells)), points.shape[1]) if points.size else points.shape
 
 
 def _shells(receivers: Receivers, shell: wp.array | None) -> np.ndarray:
