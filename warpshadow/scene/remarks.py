@@ -21,7 +21,6 @@ _CEILING_RATIO = 1.01  # ratio of breadths up to which a body is as broad as its
 _LOW_SUN = -0.02  # height of the direction to a sun from which on it is below the horizon, by more than its rim
 _MARGIN = 3.0  # breadths of the frame around its middle in which a body's shadow may be meant to be seen alone
 _ROUNDED = 0.08  # mean difference of normals from which rounded edges are said
-_SORTED_PART = 4  # a fourth of the pixels is sorted alone if it sends half of the light, as in maps of skies and rooms
 _METAL = 0.5  # share of metal from which a body is one
 
 
@@ -195,15 +194,9 @@ def _share_of_brightest_half(light: EnvironmentMap) -> float:
     solid_angles = np.repeat(light.solid_angles(), light.radiance.shape[1])
     luminances = light.radiance.reshape(-1, 3) @ np.full(3, 1 / 3)
     half_power = solid_angles @ luminances / 2
-    candidates, count = np.arange(luminances.size), luminances.size // _SORTED_PART
-    if count:
-        brightest = np.argpartition(luminances, -count)[-count:]
-        if solid_angles[brightest] @ luminances[brightest] > half_power:
-            candidates = brightest  # so there is less to sort
-    candidates = candidates[(-luminances[candidates]).argsort()]
-    powers = (luminances * solid_angles)[candidates]
-    end = int(np.searchsorted(powers.cumsum(), half_power)) + 1
-    return float(solid_angles[candidates[:end]].sum() / (4 * np.pi))
+    brightest = (-luminances).argsort()
+    end = int(np.searchsorted((luminances * solid_angles)[brightest].cumsum(), half_power)) + 1
+    return float(solid_angles[brightest[:end]].sum() / (4 * np.pi))
 
 
 def blurred_shell(scene: Scene) -> list[str]:

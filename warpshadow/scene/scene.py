@@ -278,7 +278,7 @@ class Scene:
         is_any = self.shell is None and not any(body.is_glossy or body.is_emitter for body in self.bodies)
         return tuple(method for method in METHODS if is_any or method in FULL_LIGHT_METHODS)
 
-    @property
+    @functools.cached_property
     def direction_count(self) -> int:
         """Cells of "directional": as many as are asked for, or as many as :data:`DIRECTIONS` and those below it say.
 

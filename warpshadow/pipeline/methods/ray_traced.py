@@ -9,7 +9,7 @@ import warp as wp
 
 from warpshadow.assets.basis import Basis, CellBasis, HarmonicBasis
 from warpshadow.assets.known_light import KnownLight
-from warpshadow.device.batch import instance_of
+from warpshadow.device.batch import common_batch, instance_of
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import ExplainRow, Input, Node, detached
@@ -274,9 +274,9 @@ def _checked_points(points: wp.array) -> wp.array:
     return points
 
 
-def _batch_shape(points: wp.array, shells: np.ndarray) -> tuple[int, ...]:
+def _batch_shape(points: wp.array, shells: np.ndarray) -> tuple[int, int]:
     """Shape of results, [batch, receiver], where points or shells may be one for all instances."""
-    return (max(len(points), len(shells)), points.shape[1]) if points.size else points.shape
+    return common_batch({"points": points, "shell": shells}), points.shape[1]
 
 
 def _shells(receivers: Receivers, shell: wp.array | None) -> np.ndarray:

@@ -15,7 +15,7 @@ import warp as wp
 
 from warpshadow.device.batch import instance_of
 from warpshadow.device.constants import constant
-from warpshadow.device.memory import copied
+from warpshadow.device.launch import without_gradient
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node, detached, field_of
@@ -74,7 +74,7 @@ class MirroredBodies:
         """
         faces, filters = self._merged_scene.faces, field_of(samples, "filters")
         directions, transmittance = (
-            Node("", _constant, node) for node in (field_of(samples, "directions"), transmittance)
+            Node("", without_gradient, node) for node in (field_of(samples, "directions"), transmittance)
         )
 
         def trace() -> Node:
@@ -129,8 +129,3 @@ class MirroredBodies:
         wp.copy(self._mesh.points, positions)
         self._mesh.refit()
         return self._mesh
-
-
-def _constant(array: wp.array) -> wp.array:
-    """The array without its gradient."""
-    return copied(array) if array.requires_grad else array
