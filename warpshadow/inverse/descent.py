@@ -16,8 +16,7 @@ from warpshadow.check import AnyPath
 from warpshadow.device.progress import progress_bar, remark
 from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.diagnostics import warn_before, warn_of
-from warpshadow.inverse.free.base import Free, Values
-from warpshadow.inverse.free.lamp import Lamp
+from warpshadow.inverse.free import Free, Values
 from warpshadow.inverse.model import torch_on_one_thread
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import Curvature, QuasiNewton
@@ -114,19 +113,14 @@ class _Descent:
         scatter = self.stages[self.stage].scatter
         if count > 0 and scatter == "flat":
             return candidates_along_flat_direction(self.problem, self.context, values, count)
-        if scatter == "lamps":
-            return [self._relocated(values, number) for number in range(count)]
         generator = torch.Generator().manual_seed(self.seed)
-        return [
-            {free.name: free.scattered(values[free.name], number, generator) for free in self.problem.free}
-            for number in range(count)
-        ]
 
-    def _relocated(self, values: Mapping[str, Values], number: int) -> dict[str, Values]:
-        """Values with free lamps elsewhere."""
-        lamps = {lamp.name: lamp for lamp in self.problem.free_of(Lamp)}
-        copies = _copy_values(values)
-        return copies | {name: lamp.relocated(copies[name], self.context, number) for name, lamp in lamps.items()}
+        def perturbed(free: Free, number: int) -> Values:
+            if scatter == "lamps":
+                return free.relocated(values[free.name], self.context, number)
+            return free.scattered(values[free.name], number, generator)
+
+        return [{free.name: perturbed(free, number) for free in self.problem.free} for number in range(count)]
 
     def begin_stage(self) -> None:
         """Set up the model of a stage, and its first candidate."""

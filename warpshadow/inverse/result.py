@@ -10,7 +10,7 @@ import torch
 
 from warpshadow.assets.camera import Camera
 from warpshadow.inverse.found_light import FoundLight, found_light
-from warpshadow.inverse.free.base import Values
+from warpshadow.inverse.free import Values
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
@@ -59,7 +59,7 @@ class Result:
     @functools.cached_property
     def light(self) -> FoundLight | None:
         """The light that was found, and which directions of it the images determined; None where it was not free."""
-        if self.problem.basis is None:
+        if self.problem.light is None:
             return None
         return found_light(self.scene.light, self.problem, self.context, self.values)
 

@@ -19,9 +19,8 @@ import numpy as np
 import torch
 
 from warpshadow.assets.basis import CellBasis
-from warpshadow.inverse.free.base import Values
-from warpshadow.inverse.free.emission import Emission
-from warpshadow.inverse.free.light import Light, neighboring_cells
+from warpshadow.inverse.free import Emission, Light, Values
+from warpshadow.inverse.free.light import neighboring_cells
 from warpshadow.inverse.model import LightModel, Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
@@ -40,7 +39,8 @@ class ProjectedModel(Model):
 
     def __init__(self, problem: Problem, context: FitContext, stage: Stage):
         super().__init__(problem, context, stage)
-        (self.light,) = problem.free_of(Light)
+        assert problem.light is not None
+        self.light = problem.light
         self.atoms = atoms(self.light)
         self.lamps = [emission for emission in problem.free_of(Emission) if emission.is_light]
         self.lamp_units = np.ones(len(self.lamps))  # emission that lights an image as much as an atom does

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,6 +58,8 @@ class Pose(FreeOfBody):
 
     key = "pose"
     moves = True
+    reframes = True
+    has_prior = True
 
     rotation: str = "axis-angle"
     scale: bool = False
@@ -122,7 +124,7 @@ class Pose(FreeOfBody):
             return numbered_pose
         return replace(numbered_pose, stands_on=scene.body_number(self.stands_on, "stands_on"))
 
-    def check_scene(self, scene: Scene) -> None:
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         if self.stands_on is None:
             return
         ground = scene.body_number(self.stands_on, "stands_on")
@@ -235,10 +237,9 @@ class Pose(FreeOfBody):
         rotation, translation, scale = (part.cpu().numpy() for part in self._posed(values, context))
         fitted.change_body(self.number, rotation=rotation, translation=translation, scale=float(scale))
 
-    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        body = fitted.scene.bodies[self.number]
-        names = ("rotation", "translation", "scale") if self.scale else ("rotation", "translation")
-        return {f"{self.called(fitted)}.{name}": getattr(body, name) for name in names}
+    @property
+    def body_figures(self) -> tuple[str, ...]:
+        return ("rotation", "translation", "scale") if self.scale else ("rotation", "translation")
 
 
 def _rotation_vector(matrix: torch.Tensor) -> torch.Tensor:
