@@ -163,7 +163,9 @@ def test_a_near_lamp_is_found_from_straight_above_beside_pose_color_and_map(phot
     stages = photograph_stages(one)
     assert [stage.scatter for stage in stages[3:]] == ["lamps", "flat", "turned"]
     result = fit(one, stages, progress=False)
-    assert len(result.losses) >= 3 + 1 + Lamp.relocation_count + 1  # of all directions, also after an outline that stood out
+    assert (
+        len(result.losses) >= 3 + 1 + Lamp.relocation_count + 1
+    )  # of all directions, also after an outline that stood out
     offset, true = (np.subtract(place, (0, 1, 0)) for place in (result.scene.bodies[2].translation, PLACE))
     cosine = offset @ true / np.linalg.norm(offset) / np.linalg.norm(true)
     assert np.degrees(np.arccos(cosine)) < SMALL_ANGLE

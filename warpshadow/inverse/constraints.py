@@ -46,6 +46,7 @@ class PoseConstraint:
     plane: PlaneConstraint | None = None  # that the body touches, if any
     onto: np.ndarray | None = None  # shift by a unit along the normal, and no fixed coordinate, [3]
     hull: np.ndarray | None = None  # vertices of the mesh's convex hull, [vertex, 3]; for a plane
+    remark: str = ""  # how it rests on the plane, where the scene and stability differ
 
     def turn(self, values: torch.Tensor) -> torch.Tensor:
         """The axis-angle vector of coordinates among the possible ones. Differentiable: values."""

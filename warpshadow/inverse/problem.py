@@ -151,10 +151,10 @@ class Problem:
     def visibility(self) -> Visibility:
         """Visibility settings of the fit."""
         visibility = self.scene.visibility if self.moves or self.still is None else self.still
-        least = max(free.min_directions for free in self.free)
-        if not least or visibility.method != "directional":
+        min_directions = max(free.min_directions for free in self.free)
+        if not min_directions or visibility.method != "directional":
             return visibility
-        return replace(visibility, directions=max(self.scene.direction_count, least))
+        return replace(visibility, directions=max(self.scene.direction_count, min_directions))
 
     @property
     def light(self) -> Light | None:

@@ -182,7 +182,7 @@ def found_values(result: Result) -> list[str]:
         directions = sh.equirectangular_directions(len(radiance)).astype(np.float32)
         x, y, z = directions.reshape(-1, 3)[radiance.sum(axis=2).argmax()]
         rows.append(("light", f"strongest from ({x:.3f}, {y:.3f}, {z:.3f})"))
-    rows += [row for free in result.problem.free for row in free.report(result.found)]
+    rows += [row for free in result.problem.free for row in free.report(result.context, result.found)]
     width = max((len(name) for name, _ in rows), default=0)
     return [f"{name:{width}}  {text}" for name, text in rows]
 

@@ -48,6 +48,7 @@ class PoseUncertainty:
         least_turn: Turn beside it [degrees].
         along_view: Part of the shift that is along the view, 0 to 1.
         diagonal: Of the body's bounding box [scene units].
+        remark: How it stands, if that was assumed: deviations do not know of it.
     """
 
     shift: np.ndarray
@@ -56,6 +57,7 @@ class PoseUncertainty:
     least_turn: float
     along_view: float
     diagonal: float
+    remark: str = ""
 
     @property
     def is_flat(self) -> bool:
@@ -68,7 +70,8 @@ class PoseUncertainty:
         direction_text = (
             "along the view" if self.along_view > 0.9 else f"along {np.round(self.least / max(length, 1e-12), 2)}"
         )
-        return f"known least: ±{length:.2g} {direction_text}, turned by ±{self.least_turn:.2g}°"
+        text = f"known least: ±{length:.2g} {direction_text}, turned by ±{self.least_turn:.2g}°"
+        return f"{text}; it {self.remark}" if self.remark else text
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,6 +318,7 @@ def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) 
         float(np.degrees(np.linalg.norm(weakest_direction[3:]) / half)),
         view_share,
         2 * half,
+        free.constraint(context).remark,
     )
 
 

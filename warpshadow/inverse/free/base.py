@@ -22,7 +22,7 @@ PRIOR = 1e-3
 
 
 class Free(abc.ABC):
-    """A free parameter of a scene. Other files ask what they need to know here, and name no class."""
+    """A free parameter of a scene. Other files ask it alone, and name no class."""
 
     key: ClassVar[str]
     """Its name in fit files."""
@@ -64,7 +64,7 @@ class Free(abc.ABC):
 
     @property
     def scales(self) -> str:
-        """What it may multiply by any number: "light", "reflectance", "exposure" or "", none of these."""
+        """Factor of images that it may be: "light", "reflectance", "exposure" or "", none of these."""
         return ""
 
     @property
@@ -114,7 +114,7 @@ class Free(abc.ABC):
         """The fitted numbers by their keys in scene files, if they are few."""
         return {}
 
-    def report(self, fitted: FittedScene) -> list[tuple[str, str]]:
+    def report(self, context: FitContext, fitted: FittedScene) -> list[tuple[str, str]]:
         """Lines of a report, name and value, beside those of the fields of bodies that changed."""
         return []
 

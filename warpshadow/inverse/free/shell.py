@@ -72,6 +72,6 @@ class Shell(Free):
         assert fitted.scene.shell is not None
         return {"light.radius": fitted.scene.shell[3]}
 
-    def report(self, fitted: FittedScene) -> list[tuple[str, str]]:
+    def report(self, context: FitContext, fitted: FittedScene) -> list[tuple[str, str]]:
         assert fitted.scene.shell is not None
         return [("light radius", f"{fitted.scene.shell[3]:.4g} scene units")]

@@ -154,7 +154,7 @@ class Sun(Free):
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
         return {f"sun.{name}": value for name, value in fitted.sun.items()}
 
-    def report(self, fitted: FittedScene) -> list[tuple[str, str]]:
+    def report(self, context: FitContext, fitted: FittedScene) -> list[tuple[str, str]]:
         units = {"angular_radius": "°"}
         return [
             (f"sun {name}", f"({format_numbers(value)}){units.get(name, '')}") for name, value in fitted.sun.items()

@@ -75,7 +75,7 @@ class Exposure(Free):
         figures: dict[str, ArrayLike] = {"exposure": fitted.exposures}
         return figures | ({"white_balance": fitted.white_balances} if self.white_balance else {})
 
-    def report(self, fitted: FittedScene) -> list[tuple[str, str]]:
+    def report(self, context: FitContext, fitted: FittedScene) -> list[tuple[str, str]]:
         return [("exposure", f"{format_numbers(np.log2(fitted.exposures))} stops")]
 
 
