@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from warpshadow import check
+from warpshadow.assets.image import write_image
 from warpshadow.check import AnyPath
 from warpshadow.device.progress import progress_bar, remark
 from warpshadow.inverse import checkpoint as checkpoints
@@ -24,7 +25,7 @@ from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage, check_part, stages_for
 from warpshadow.inverse.uncertainty import candidates_along_flat_direction
 from warpshadow.inverse.variable_projection import make_model
-from warpshadow.inverse.watch import Watch, watching, write_preview
+from warpshadow.inverse.watch import Watch, side_by_side, watching
 from warpshadow.viewer import FitViewer
 
 MAX_QUASI_NEWTON_VALUES = 100  # up to how many values are found by quasi-Newton steps unless an optimizer is named
@@ -461,7 +462,7 @@ def _descend(
                 save_time = time.perf_counter()
             if preview is not None and current_time - preview_time >= preview_seconds:
                 with torch.no_grad():
-                    write_preview(preview, descent.model.targets, descent.model.images(descent.values))
+                    write_image(preview, side_by_side(descent.model.targets, descent.model.images(descent.values)))
                 preview_time = time.perf_counter()
             bar.update()
             stage_text = f"stage {descent.stage + 1} of {len(descent.stages)}"

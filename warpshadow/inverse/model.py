@@ -8,10 +8,9 @@ import torch
 
 from warpshadow.inverse.free import Values
 from warpshadow.inverse.loss import clip_saturated
-from warpshadow.inverse.outlines import outlines_of
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
-from warpshadow.inverse.target import stack_targets
+from warpshadow.inverse.target import outlines_of, stack_targets
 from warpshadow.inverse.world import FitContext, World
 from warpshadow.torch import TorchRenderer
 

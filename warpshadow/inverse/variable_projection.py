@@ -149,9 +149,7 @@ def atoms(light: Light) -> np.ndarray:
 def nonnegative_least_squares(form: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """The x ≥ 0 of the least xᵀ F x − 2 sᵀ x [Lawson and Hanson 1974, on a square root of F].
 
-    Args:
-        form: F, symmetric and positive semidefinite, [n, n]; directions in which it is about 0 get a ridge.
-        slope: s, [n].
+    The form F is symmetric and positive semidefinite, [n, n]; directions in which it is about 0 get a ridge.
     """
     from scipy.optimize import nnls
 
