@@ -17,7 +17,7 @@ from warpshadow.check import AnyPath
 from warpshadow.device.progress import progress_bar, remark
 from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.diagnostics import warn_before, warn_of
-from warpshadow.inverse.free import Free, Values
+from warpshadow.inverse.free.base import Free, Values
 from warpshadow.inverse.model import torch_on_one_thread
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import Curvature, QuasiNewton

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from warpshadow import check
-from warpshadow.inverse.free import Exposure, Pose, Values
+from warpshadow.inverse.free import Exposure, Pose
+from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem

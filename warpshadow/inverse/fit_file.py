@@ -15,7 +15,8 @@ from warpshadow.assets.image import image_size
 from warpshadow.check import AnyPath
 from warpshadow.inverse.descent import default_optimizer, fit, short_adam
 from warpshadow.inverse.encoding import is_curve_file
-from warpshadow.inverse.free import FREE, Free, FreeOfBody
+from warpshadow.inverse.free import FREE
+from warpshadow.inverse.free.base import Free, FreeOfBody
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import QuasiNewton

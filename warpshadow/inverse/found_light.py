@@ -21,7 +21,8 @@ from warpshadow.assets.known_light import as_light
 from warpshadow.assets.light import KnownLightArgument
 from warpshadow.assets.picture import Picture
 from warpshadow.inverse.diagnostics import small_stage
-from warpshadow.inverse.free import Light, Values
+from warpshadow.inverse.free import Light
+from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.world import FitContext

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from warpshadow.inverse.free import Values
+from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage

@@ -15,7 +15,8 @@ from warpshadow import check
 from warpshadow.assets.basis import Basis
 from warpshadow.assets.camera import Camera
 from warpshadow.check import AnyPath
-from warpshadow.inverse.free import Free, FreeOfBody, Light, Values
+from warpshadow.inverse.free import Light
+from warpshadow.inverse.free.base import Free, FreeOfBody, Values
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import FitContext, FittedScene

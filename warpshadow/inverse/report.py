@@ -17,7 +17,7 @@ from warpshadow.assets.picture import Picture
 from warpshadow.check import AnyPath
 from warpshadow.inverse.diagnostics import DiagnosticWarning
 from warpshadow.inverse.encoding import toml_value
-from warpshadow.inverse.free import Values
+from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model, torch_on_one_thread
 from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage

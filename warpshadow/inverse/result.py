@@ -10,7 +10,7 @@ import torch
 
 from warpshadow.assets.camera import Camera
 from warpshadow.inverse.found_light import FoundLight, found_light
-from warpshadow.inverse.free import Values
+from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 
 from warpshadow.inverse.diagnostics import small_stage
-from warpshadow.inverse.free import Plane, Pose, Values
-from warpshadow.inverse.free.base import PRIOR
+from warpshadow.inverse.free import Plane, Pose
+from warpshadow.inverse.free.base import PRIOR, Values
 from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem

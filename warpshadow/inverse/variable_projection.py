@@ -19,7 +19,8 @@ import numpy as np
 import torch
 
 from warpshadow.assets.basis import CellBasis
-from warpshadow.inverse.free import Emission, Light, Values
+from warpshadow.inverse.free import Emission, Light
+from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.free.light import neighboring_cells
 from warpshadow.inverse.model import LightModel, Model
 from warpshadow.inverse.problem import Problem

@@ -16,7 +16,7 @@ import torch
 from warpshadow import check
 from warpshadow.assets.color import auto_exposure, srgb_to_linear
 from warpshadow.device.progress import in_ipython
-from warpshadow.inverse.free import Values
+from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.schedule import Stage
 from warpshadow.viewer import FitViewer

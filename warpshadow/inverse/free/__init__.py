@@ -4,7 +4,7 @@ Each starts where the scene has it. Values are in natural units (radians, half d
 targets' own radiance), so that one learning rate serves all.
 """
 
-from warpshadow.inverse.free.base import Free, FreeOfBody, Values
+from warpshadow.inverse.free.base import Free
 from warpshadow.inverse.free.emission import Emission
 from warpshadow.inverse.free.gloss import Metallic, Roughness
 from warpshadow.inverse.free.lamp import Lamp
@@ -22,26 +22,3 @@ FREE: tuple[type[Free], ...] = (
     *(Albedo, Texture, Roughness, Metallic, Emission, Lamp, Pose, Plane, Deformation, Radii),
 )
 """All that may be free, in the order in which fit files list them."""
-
-__all__ = [
-    "FREE",
-    "Albedo",
-    "CameraPose",
-    "Deformation",
-    "Emission",
-    "Exposure",
-    "Free",
-    "FreeOfBody",
-    "Lamp",
-    "Light",
-    "Metallic",
-    "OutlineOffset",
-    "Plane",
-    "Pose",
-    "Radii",
-    "Roughness",
-    "Shell",
-    "Sun",
-    "Texture",
-    "Values",
-]

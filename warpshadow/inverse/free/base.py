@@ -22,7 +22,7 @@ PRIOR = 1e-3
 
 
 class Free(abc.ABC):
-    """A free parameter of a scene. Other files ask it alone, and name no class."""
+    """A free parameter of a scene. Fits ask it alone: no other file has a list of classes."""
 
     key: ClassVar[str]
     """Its name in fit files."""
