@@ -39,7 +39,7 @@ BODY, TABLE = 0, 1
 SHADOWS = ws.Visibility(directions=64)
 TWO_COLORS: dict[str, Any] = {"palette": 1.0, "colors": 2}
 FEW_EDGES: dict[str, Any] = {"total_variation": 0.05}
-LIGHT = inverse.Light(None, directions=64)
+LIGHT = inverse.Light(directions=64)
 TILT, HEIGHT = np.radians(2.0), 0.1  # of a scan's base, and of the table [scene units], standard deviations
 TABLE_TILT = np.radians(0.2)
 EXPOSURE = 0.25  # of the stand-in: white tiles in the sun do not saturate

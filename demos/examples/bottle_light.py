@@ -47,7 +47,7 @@ from warpshadow import inverse
 
 FINE = ws.Visibility(directions=256)
 REACH = 1.25  # heights of the body: as far from its foot its shadow tells of the light
-CELLS = inverse.Light(None, directions=256)
+CELLS = inverse.Light(directions=256)
 ALBEDO = 0.8  # of light squares: an image has only its product with the light
 RING = 0.1, 0.4  # around a foot, where shadows are measured, from its edge [heights of the body]
 SECTOR, FEWEST = 15, 20  # of a ring [degrees]; pixels that tell of it

@@ -106,7 +106,7 @@ def recover_light(scene: ws.Scene, target: np.ndarray, iterations: int) -> tuple
     start = time.perf_counter()
     unknown = dataclasses.replace(scene, light=ws.EnvironmentMap.constant(0.5))
     still = ws.Visibility(method="none" if scene.visibility.method == "none" else "ray-traced")
-    light = inverse.Light(None, directions=CELLS)
+    light = inverse.Light(directions=CELLS)
     problem = inverse.Problem(unknown, inverse.Target(target), light, still=still)
     # a quarter of the pixels tells as much of the light
     stage = inverse.Stage(iterations, learning_rate=0.15, scale=0.5)

@@ -1,6 +1,7 @@
 """Constraints of a pose: poses that stay possible, at any values, with their derivatives; and priors."""
 
 import dataclasses
+import re
 import warnings
 
 import numpy as np
@@ -13,6 +14,7 @@ import warpshadow as ws
 from warpshadow.inverse import Pose, Problem, Stage, Target, fit, load_fit
 from warpshadow.inverse.constraints import hull_points, plane_below, stable_rotation, turn_onto
 from warpshadow.inverse.free.base import PRIOR
+from warpshadow.inverse.report import found_values
 
 # Float32 of positions of a few units.
 FLOAT32 = 2e-6
@@ -301,12 +303,25 @@ def test_a_hull_has_the_lowest_vertex_of_any_rotation():
 
 
 def test_a_warning_says_by_how_much_a_body_is_turned_onto_its_stable_support():
-    with pytest.warns(UserWarning, match=r"box: its stable support differs from the scene's pose by 1\.2°.*given"):
-        prepared(scene(box((1.2, 0.0, 0.0))), Pose("box", stands_on="table"))
+    for pose in (Pose("box", stands_on="table"), Pose("box", stands_on="table", resting="stable")):
+        with pytest.warns(UserWarning, match=r'box was turned by 1\.2° onto its stable support; resting = "given"'):
+            free, context, values = prepared(scene(box((1.2, 0.0, 0.0))), pose)
+        np.testing.assert_allclose(moved_body(free, context, values).rotation_matrix(), np.eye(3), atol=1e-6)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         prepared(scene(box((0.0, 30.0, 0.0))), Pose("box", stands_on="table"))
         prepared(scene(box((1.2, 0.0, 0.0))), Pose("box", stands_on="table", resting="given"))
+
+
+def test_a_body_that_touches_the_plane_stands_as_in_the_scene_and_the_result_says_so():
+    placed = box((1.2, 0.0, 0.0)).on_ground((0.2, 0.0, 0.1))
+    problem = Problem(scene(placed), Target(np.full((36, 48, 3), 0.3)), Pose("box", stands_on="table"))
+    with pytest.warns(UserWarning, match=r'box stands 1\.2° off its stable support; resting = "stable" turns it'):
+        result = fit(problem, Stage(1), progress=False)
+    start, found = placed.rotation_matrix(), result.scene.bodies[0].rotation_matrix()
+    np.testing.assert_allclose(found[:, 1] @ [0, 1, 0], start[:, 1] @ [0, 1, 0], atol=1e-5)
+    assert any(re.fullmatch(r"box +stands 1\.2° off its stable support", line) for line in found_values(result))
+    assert str(result.uncertainty.poses["box"]).endswith("°; it stands 1.2° off its stable support")
 
 
 def test_a_body_that_nearly_stands_keeps_the_rotation_of_the_scene():

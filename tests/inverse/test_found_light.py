@@ -45,7 +45,7 @@ def fitted(scene, *free, cameras=(None,), mask=None):
 
 @pytest.mark.parametrize(
     "free",
-    [(inverse.Light(3),), (inverse.Light(None, directions=64), inverse.Albedo(0)), (inverse.Light(3), inverse.Pose(0))],
+    [(inverse.Light(3),), (inverse.Light(directions=64), inverse.Albedo(0)), (inverse.Light(3), inverse.Pose(0))],
     ids=["light", "cells and albedo", "light and pose"],
 )
 def test_over_a_ground_the_lower_half_is_not_determined(free):

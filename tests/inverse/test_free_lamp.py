@@ -8,14 +8,13 @@ import torch
 
 import warpshadow as ws
 from warpshadow.inverse import Albedo, Emission, Lamp, Light, Pose, Problem, Stage, Target, fit, photograph_stages
-from warpshadow.inverse.free.lamp import STARTS
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.uncertainty import NormalMatrix
 from warpshadow.inverse.variable_projection import ProjectedModel
 
 CPU = torch.device("cpu")
 SOLVED = Stage(solves_light=True)
-CELLS = Light(None, directions=32, smoothness=1e-3)
+CELLS = Light(directions=32, smoothness=1e-3)
 PLACE = np.array([1.8, 3.8, 0.9])  # out of view
 SMALL_ANGLE = 3.0  # degrees by which the lamp is off from a start 60° away. Measured 0.3.
 CELL_LIGHT = 0.01  # relative L2 of an image in cells of light against one in the map. Measured 0.004.
@@ -81,12 +80,12 @@ def test_searches_start_all_over_the_upper_hemisphere(photograph):
     context = one.context(CPU)
     lamp, start = Lamp(2), one.start(context)
     towards = []
-    for number in range(STARTS):
+    for number in range(Lamp.relocation_count):
         body = placed(one, start | {"lamp[2]": lamp.relocated(start["lamp[2]"], context, number)})
         offset = np.subtract(body.translation, (0, 1, 0))
         assert np.linalg.norm(offset) == pytest.approx(np.linalg.norm(PLACE - (0, 1, 0)), rel=1e-3)
         towards.append(offset / np.linalg.norm(offset))
-    cosines = np.array(towards) @ np.array(towards).T - 2 * np.eye(STARTS)
+    cosines = np.array(towards) @ np.array(towards).T - 2 * np.eye(Lamp.relocation_count)
     assert min(direction[1] for direction in towards) > 0
     assert np.degrees(np.arccos(cosines.max())) > 30
 
@@ -164,7 +163,9 @@ def test_a_near_lamp_is_found_from_straight_above_beside_pose_color_and_map(phot
     stages = photograph_stages(one)
     assert [stage.scatter for stage in stages[3:]] == ["lamps", "flat", "turned"]
     result = fit(one, stages, progress=False)
-    assert len(result.losses) >= 3 + 1 + STARTS + 1  # of all directions, also after an outline that stood out
+    assert (
+        len(result.losses) >= 3 + 1 + Lamp.relocation_count + 1
+    )  # of all directions, also after an outline that stood out
     offset, true = (np.subtract(place, (0, 1, 0)) for place in (result.scene.bodies[2].translation, PLACE))
     cosine = offset @ true / np.linalg.norm(offset) / np.linalg.norm(true)
     assert np.degrees(np.arccos(cosine)) < SMALL_ANGLE
@@ -177,5 +178,5 @@ def test_bodies_that_do_not_emit_are_no_lamps(photograph):
         problem(photograph, Lamp("body"))
     with pytest.raises(ValueError, match="a scene of lamps alone"):
         problem(photograph, Lamp("lamp"), start=scene(LAMP))
-    with pytest.raises(ValueError, match=r"got Lamp\(2\) and Pose\(2\)"):
+    with pytest.raises(ValueError, match=r"got pose\[2\] and lamp\[2\]"):
         problem(photograph, CELLS, Lamp("lamp"), Pose("lamp"))

@@ -161,7 +161,7 @@ def test_a_plane_and_the_body_on_it_are_found():
     [
         (Plane("box"), "body: got 'box', which is not flat"),
         (Plane("table", carries=["table"]), "carries: got 1, the plane itself"),
-        ([Plane("table"), Pose("table")], "plane[1]: got a free pose of the same body"),
+        ([Plane("table"), Pose("table")], "free: got pose[1] and plane[1], expected one of them: both place the body"),
         (
             [Plane("table"), Pose("box", stands_on="table", distance=(5, 0.1))],
             "pose[0]: got a distance beside a free plane[1]",

@@ -55,7 +55,7 @@ DIM = ws.EnvironmentMap.constant(0.5, radius=5.0, center=CENTER)
 
 @pytest.mark.slow
 def test_a_fit_finds_the_side_and_the_distance_of_a_window(tmp_path):
-    problem = problem_of(DIM, window(2.0), inverse.Shell(), inverse.Light(None, directions=128))
+    problem = problem_of(DIM, window(2.0), inverse.Shell(), inverse.Light(directions=128))
     stages = [inverse.Stage(30, 0.05, solves_light=True), inverse.Stage(10, 0.02, solves_light=True)]
     result = inverse.fit(problem, stages, progress=False)
     light = result.scene.light
@@ -82,7 +82,7 @@ def test_the_radius_that_a_fit_finds_is_in_its_summary_and_said_after_few_steps(
 
 
 def test_light_that_a_fit_finds_keeps_its_radius():
-    problem = problem_of(DIM, window(5.0), inverse.Light(None, directions=64))
+    problem = problem_of(DIM, window(5.0), inverse.Light(directions=64))
     light = inverse.fit(problem, [inverse.Stage(2)], progress=False).scene.light
     assert light.radius == 5.0 and np.allclose(light.center, CENTER)
 

@@ -141,7 +141,7 @@ def test_light_that_takes_no_sun_and_suns_that_are_none_are_refused():
         problem(ws.EnvironmentMap.constant(0.5, radius=5.0), sun)
     with pytest.raises(ValueError, match="sun: got it for light in spherical harmonics"):
         problem(np.ones((9, 3), np.float32), sun)
-    with pytest.raises(ValueError, match="free: got Light and Sun, expected one of them"):
+    with pytest.raises(ValueError, match="free: got light and sun, expected one of them: free light has any sun in it"):
         problem(SKY, sun, inverse.Light())
 
 

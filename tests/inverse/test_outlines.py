@@ -9,8 +9,8 @@ from scipy import ndimage
 
 import warpshadow as ws
 from warpshadow.inverse import OutlineOffset, Pose, Problem, Stage, Target, fit, load_fit
+from warpshadow.inverse.edges import signed_distances
 from warpshadow.inverse.model import Model
-from warpshadow.inverse.outlines import signed_distances
 
 # Distances of pixels of an edge that is not along the axes, from the part that they cover.
 SUBPIXEL = 0.15

@@ -412,3 +412,29 @@ def test_scenes_of_which_one_method_shows_all_are_tuned_and_left_to_auto(few, fe
     automatic = dataclasses.replace(scene, visibility=ws.Visibility("auto", error=0.1))
     assert resolved(automatic).visibility.method == "directional"
     assert "shading" in str(ws.Renderer(automatic, progress=False).explain())
+
+
+def test_an_interrupted_run_leaves_the_errors_that_it_measured(instant, monkeypatch, capsys):
+    shading, count = PointSample.shading, 0
+
+    def interrupted(self, scene):
+        nonlocal count
+        count += 1
+        if count > 5:
+            raise KeyboardInterrupt
+        return shading(self, scene)
+
+    monkeypatch.setattr(PointSample, "shading", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        tune.tune(make_scene(), error=0.1)
+    head, *lines = [line for line in capsys.readouterr().err.splitlines() if re.search(r"error$|\d%$", line)]
+    assert head.split() == ["method", "bounces", "spheres", "receivers", "error"] and 1 <= len(lines) <= 5
+
+
+def test_settings_that_compile_kernels_come_first():
+    scene = make_scene()
+    methods = [("directional", 32), ("directional", 64), ("log-sh", None), ("directional", 128), ("none", None)]
+    settings = [dataclasses.replace(scene, visibility=ws.Visibility(m, directions=n)) for m, n in methods]
+    order, compiling_count = tune._measuring_order(settings)
+    assert sorted(order) == list(range(5)) and compiling_count == 3
+    assert {settings[number].visibility.method for number in order[:3]} == {"directional", "log-sh", "none"}

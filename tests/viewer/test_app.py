@@ -17,7 +17,6 @@ from websockets.exceptions import ConnectionClosed  # noqa: E402
 
 from warpshadow.viewer.app import ViewerApp  # noqa: E402
 from warpshadow.viewer.server import is_own  # noqa: E402
-from warpshadow.viewer.state import BodyGloss  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")  # a site says so to all but pytest
 
@@ -104,11 +103,11 @@ def test_a_slider_changes_the_gloss_of_a_body(site, page):
     since = len(page.heard)
     page.enter("ball: metallic", 1.0)
     assert np.abs(shown(site, page, since) - before).mean() > 1
-    assert site.loop.viewer_state.gloss == (BodyGloss(0.6, 1.0),)
+    assert site.loop.viewer_state.gloss[0]["metallic"] == 1.0
     page.enter("ball: roughness", 7.0)
     page.until(lambda message: "roughness: got 7.0" in str(message))
     page.enter("ball: metallic", 0.0)
-    eventually(lambda: site.loop.viewer_state.gloss == (BodyGloss(0.6, 0.0),))
+    eventually(lambda: site.loop.viewer_state.gloss[0] == {"roughness": 0.6, "metallic": 0.0, "specular": 1.0})
 
 
 def test_a_body_is_dragged_by_handles_and_put_back(site, page):

@@ -10,7 +10,7 @@ from warpshadow.scene.visibility import Visibility
 from warpshadow.viewer.page_camera import PageCamera
 from warpshadow.viewer.painter import Painter, bounds, distances, error_picture, own_page, picture, relative_error
 from warpshadow.viewer.quality import Quality
-from warpshadow.viewer.state import ERROR, BodyGloss, BodyPose, ViewerState
+from warpshadow.viewer.state import ERROR, BodyPose, ViewerState
 
 # float32 sums in another order, and a camera that went through a quaternion
 SAME_IMAGE = 2e-4
@@ -175,9 +175,9 @@ def test_gloss_that_is_changed_is_that_of_the_scene_so_changed(scene):
     scene = dataclasses.replace(scene, bodies=(shiny, scene.bodies[1]))
     painter = Painter(scene)
     page, start = own_page(scene, painter.page_scale), ViewerState.of(scene)
-    assert start.gloss == (BodyGloss(0.5, 0.0), BodyGloss())
+    assert start.gloss == ({"roughness": 0.5, "metallic": 0.0, "specular": 1.0}, {})
     plain = painter.image(start, page, FULL)
-    viewer_state = dataclasses.replace(start, gloss=(BodyGloss(0.35, 1.0), BodyGloss()))
+    viewer_state = dataclasses.replace(start, gloss=({"roughness": 0.35, "metallic": 1.0}, {}))
     image = painter.image(viewer_state, page, FULL)
     assert difference(image, ws.render(viewer_state.scene(scene))) < SAME_IMAGE
     assert difference(image, plain) > 0.1 and len(painter._renderers._cached) == 1

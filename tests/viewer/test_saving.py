@@ -11,7 +11,7 @@ import warpshadow as ws
 from warpshadow.viewer.page_camera import PageCamera
 from warpshadow.viewer.painter import own_page
 from warpshadow.viewer.saving import as_archive, as_toml, saved_camera
-from warpshadow.viewer.state import BodyGloss, BodyPose, ViewerState
+from warpshadow.viewer.state import BodyPose, ViewerState
 
 ROUNDING = 1e-6  # of float32 maps that were turned in one step or in two; whole pixels here
 
@@ -113,7 +113,7 @@ def test_a_body_that_stood_and_a_camera_that_framed_are_where_they_were_moved_to
 def test_gloss_that_was_changed_is_in_the_scene_file(path, tmp_path):
     path.write_text(FILE.replace('name = "ball"', 'name = "ball"\nroughness = 0.5'))
     scene = ws.load_scene(path)
-    viewer_state = dataclasses.replace(ViewerState.of(scene), gloss=(BodyGloss(0.25, 1.0), BodyGloss()))
+    viewer_state = dataclasses.replace(ViewerState.of(scene), gloss=({"roughness": 0.25, "metallic": 1.0}, {}))
     (tmp_path / "saved.toml").write_bytes(as_toml(path, scene, viewer_state, scene.camera))
     ball = ws.load_scene(tmp_path / "saved.toml").bodies[0]
     assert ball.roughness == 0.25 and ball.metallic == 1

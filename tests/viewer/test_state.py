@@ -8,7 +8,7 @@ import pytest
 import warpshadow as ws
 from warpshadow.viewer import gizmo
 from warpshadow.viewer.quality import Quality
-from warpshadow.viewer.state import AS_GIVEN, BodyGloss, BodyPose, ViewerState
+from warpshadow.viewer.state import AS_GIVEN, BodyPose, ViewerState
 
 QUICK = Quality(64**2, cells=32, rays=16, supersampling=1, is_moving=True)
 ROUNDING = 1e-6  # float64
@@ -119,13 +119,13 @@ def test_what_no_page_may_ask_for_is_refused(scene, name, value):
 def test_gloss_is_that_of_bodies_that_shine_by_a_number(scene):
     ball, ground = scene.bodies
     varying = dataclasses.replace(ball, roughness=np.linspace(0, 1, ball.mesh.vertex_count), metallic=0.25)
-    for body, expected in ((ball, BodyGloss()), (varying, BodyGloss(None, 0.25))):
+    for body, expected in ((ball, {}), (varying, {"metallic": 0.25, "specular": 1.0})):
         other = dataclasses.replace(scene, bodies=(body, ground))
         viewer_state = ViewerState.of(other)
-        assert viewer_state.gloss == (expected, BodyGloss())
+        assert viewer_state.gloss == (expected, {})
         shown = viewer_state.scene(other).bodies[0]
         assert (shown.roughness is None) if body is ball else np.array_equal(shown.roughness, body.roughness)
-    changed = dataclasses.replace(viewer_state, gloss=(BodyGloss(None, 0.75), BodyGloss()))
+    changed = dataclasses.replace(viewer_state, gloss=({"metallic": 0.75}, {}))
     shown = changed.scene(other).bodies[0]
     assert shown.metallic == 0.75 and np.array_equal(shown.roughness, varying.roughness)
 
@@ -137,10 +137,10 @@ def test_a_place_is_finite():
 
 
 @pytest.mark.parametrize("name", ["roughness", "metallic"])
-def test_gloss_that_no_surface_has_is_refused(name):
+def test_gloss_that_no_surface_has_is_refused(scene, name):
     for bad in (-0.1, 1.5, float("nan"), "smooth"):
         with pytest.raises(ValueError, match=f"{name}: got .*expected a number from 0 to 1"):
-            BodyGloss(**{name: bad})
+            dataclasses.replace(ViewerState.of(scene), gloss=({name: bad}, {}))
 
 
 def test_handles_are_in_the_middle_of_a_body_and_move_it_as_they_are_moved():

@@ -410,3 +410,5 @@ def _sums_around(image: np.ndarray) -> np.ndarray:
 
 KnownLightArgument: TypeAlias = EnvironmentMap | np.ndarray
 """A known light as scenes and renderers take it: a map, or SH coefficients [order², 3]."""
+
+KNOWN_LIGHTS = (EnvironmentMap,)  # its classes; arrays are SH coefficients

@@ -147,8 +147,8 @@ def tune(
 ) -> None:
     """Measure settings on a scene, and print the cheapest that reach an error, as lines to put into the scene file.
 
-    Errors are printed before times are measured. Exit status 1: no setting reaches the error; the message names the
-    nearest one, and the next attempt.
+    Each error is printed as it is measured, before times are. Exit status 1: no setting reaches the error; the message
+    names the nearest one, and the next attempt.
     """
     from warpshadow.tuning.tune import describe
     from warpshadow.tuning.tune import tune as tune_scene

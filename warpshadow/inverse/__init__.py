@@ -9,18 +9,25 @@ from warpshadow.inverse.descent import FitWarning, default_optimizer, fit, short
 from warpshadow.inverse.diagnostics import DiagnosticWarning
 from warpshadow.inverse.fit_file import Fit, FitFileError, load_fit
 from warpshadow.inverse.found_light import FoundLight
-from warpshadow.inverse.free.base import Free
-from warpshadow.inverse.free.emission import Emission
-from warpshadow.inverse.free.gloss import Metallic, Roughness
-from warpshadow.inverse.free.lamp import Lamp
-from warpshadow.inverse.free.light import Light
-from warpshadow.inverse.free.plane import Plane
-from warpshadow.inverse.free.pose import Pose
-from warpshadow.inverse.free.reflectance import Albedo, Texture
-from warpshadow.inverse.free.shape import Deformation, Radii
-from warpshadow.inverse.free.shell import Shell
-from warpshadow.inverse.free.sun import Sun
-from warpshadow.inverse.free.views import CameraPose, Exposure, OutlineOffset
+from warpshadow.inverse.free import (
+    Albedo,
+    CameraPose,
+    Deformation,
+    Emission,
+    Exposure,
+    Free,
+    Lamp,
+    Light,
+    Metallic,
+    OutlineOffset,
+    Plane,
+    Pose,
+    Radii,
+    Roughness,
+    Shell,
+    Sun,
+    Texture,
+)
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.many import Ending, find_fits, fit_many
 from warpshadow.inverse.problem import Problem

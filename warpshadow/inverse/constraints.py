@@ -46,6 +46,7 @@ class PoseConstraint:
     plane: PlaneConstraint | None = None  # that the body touches, if any
     onto: np.ndarray | None = None  # shift by a unit along the normal, and no fixed coordinate, [3]
     hull: np.ndarray | None = None  # vertices of the mesh's convex hull, [vertex, 3]; for a plane
+    remark: str = ""  # how it rests on the plane, where the scene and stability differ
 
     def turn(self, values: torch.Tensor) -> torch.Tensor:
         """The axis-angle vector of coordinates among the possible ones. Differentiable: values."""
@@ -58,15 +59,9 @@ class PoseConstraint:
     def lower_onto_plane(
         self, pivot: torch.Tensor, rotation: torch.Tensor, scale: torch.Tensor, center: torch.Tensor
     ) -> torch.Tensor:
-        """The body's middle in the world, moved until the lowest vertex touches the plane.
+        """The body's middle in the world, ``pivot`` [3], moved until its lowest vertex touches the plane.
 
-        Args:
-            pivot: In the world, shape [3].
-            rotation: Of the body, [3, 3].
-            scale: Of the body, [].
-            center: The same middle in the body's own space, [3].
-
-        Differentiable: pivot, rotation, scale.
+        In its own space the middle is ``center`` [3]; rotation is [3, 3]. Differentiable: pivot, rotation, scale.
         """
         if self.plane is None or self.onto is None or self.hull is None:
             return pivot
@@ -150,6 +145,7 @@ def stable_rotation(
             it, not on its three corners.
     """
     from scipy.spatial import ConvexHull
+    from trimesh.triangles import points_to_barycentric
 
     points = mesh.positions.astype(np.float64)
     hull = ConvexHull(points)
@@ -157,7 +153,8 @@ def stable_rotation(
     apex = points[hull.vertices].mean(axis=0)
     tetrahedra = np.abs(np.linalg.det(corners - apex))
     centroid = (tetrahedra[:, None] * (corners.sum(axis=1) + apex) / 4).sum(axis=0) / tetrahedra.sum()
-    supports = downwards[_project_into(corners, centroid)]
+    shares = points_to_barycentric(corners, np.broadcast_to(centroid, downwards.shape))  # NaN of triangles of no area
+    supports = downwards[(shares >= -_INSIDE).all(axis=1)]
     arms = points[hull.vertices] - centroid
     returns = np.array([_returns_after_tilt(arms, down) for down in supports])
     supports = supports[returns] if returns.any() else supports
@@ -181,26 +178,13 @@ def _base_normal(points: np.ndarray, down: np.ndarray) -> np.ndarray:
 def _returns_after_tilt(arms: np.ndarray, down: np.ndarray) -> bool:
     """Whether a body on a support, tilted a little, is turned back by its weight: its contact is beyond its centroid.
 
-    Args:
-        arms: Vertices of the hull, from the centroid, [vertex, 3].
-        down: Normal of the support, outwards, shape [3].
+    Its hull has vertices at ``arms`` from the centroid, [vertex, 3], and the support a normal ``down``, outwards, [3].
     """
     first, second = perpendicular_basis([down])
     level = np.cos(_AZIMUTHS)[:, None] * first + np.sin(_AZIMUTHS)[:, None] * second
     cosine, sine = np.cos(_DISTURBANCE), np.sin(_DISTURBANCE)
     contacts = arms[np.argmax((cosine * down + sine * level) @ arms.T, axis=1)]
     return bool(((contacts * (cosine * level - sine * down)).sum(axis=1) > 0).all())
-
-
-def _project_into(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Whether a point projects into each triangle along its normal, bool of shape [triangle]."""
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    away = point - corners[:, 0]
-    a, b, c = ((u * v).sum(axis=1) for u, v in ((first, first), (first, second), (second, second)))
-    d, e = ((away * edge).sum(axis=1) for edge in (first, second))
-    area = np.maximum(a * c - b * b, np.finfo(float).tiny)
-    u, v = (c * d - b * e) / area, (a * e - b * d) / area
-    return (u >= -_INSIDE) & (v >= -_INSIDE) & (u + v <= 1 + _INSIDE)
 
 
 def turn_onto(source: np.ndarray, goal: np.ndarray) -> np.ndarray:

@@ -12,12 +12,12 @@ import torch
 import warp as wp
 
 from warpshadow import check
+from warpshadow.assets.image import write_image
 from warpshadow.check import AnyPath
 from warpshadow.device.progress import progress_bar, remark
 from warpshadow.inverse import checkpoint as checkpoints
 from warpshadow.inverse.diagnostics import warn_before, warn_of
 from warpshadow.inverse.free.base import Free, Values
-from warpshadow.inverse.free.lamp import Lamp
 from warpshadow.inverse.model import torch_on_one_thread
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import Curvature, QuasiNewton
@@ -25,7 +25,7 @@ from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage, check_part, stages_for
 from warpshadow.inverse.uncertainty import candidates_along_flat_direction
 from warpshadow.inverse.variable_projection import make_model
-from warpshadow.inverse.watch import Watch, watching, write_preview
+from warpshadow.inverse.watch import Watch, side_by_side, watching
 from warpshadow.viewer import FitViewer
 
 MAX_QUASI_NEWTON_VALUES = 100  # up to how many values are found by quasi-Newton steps unless an optimizer is named
@@ -114,19 +114,14 @@ class _Descent:
         scatter = self.stages[self.stage].scatter
         if count > 0 and scatter == "flat":
             return candidates_along_flat_direction(self.problem, self.context, values, count)
-        if scatter == "lamps":
-            return [self._relocated(values, number) for number in range(count)]
         generator = torch.Generator().manual_seed(self.seed)
-        return [
-            {free.name: free.scattered(values[free.name], number, generator) for free in self.problem.free}
-            for number in range(count)
-        ]
 
-    def _relocated(self, values: Mapping[str, Values], number: int) -> dict[str, Values]:
-        """Values with free lamps elsewhere."""
-        lamps = {lamp.name: lamp for lamp in self.problem.free_of(Lamp)}
-        copies = _copy_values(values)
-        return copies | {name: lamp.relocated(copies[name], self.context, number) for name, lamp in lamps.items()}
+        def perturbed(free: Free, number: int) -> Values:
+            if scatter == "lamps":
+                return free.relocated(values[free.name], self.context, number)
+            return free.scattered(values[free.name], number, generator)
+
+        return [{free.name: perturbed(free, number) for free in self.problem.free} for number in range(count)]
 
     def begin_stage(self) -> None:
         """Set up the model of a stage, and its first candidate."""
@@ -467,7 +462,7 @@ def _descend(
                 save_time = time.perf_counter()
             if preview is not None and current_time - preview_time >= preview_seconds:
                 with torch.no_grad():
-                    write_preview(preview, descent.model.targets, descent.model.images(descent.values))
+                    write_image(preview, side_by_side(descent.model.targets, descent.model.images(descent.values)))
                 preview_time = time.perf_counter()
             bar.update()
             stage_text = f"stage {descent.stage + 1} of {len(descent.stages)}"

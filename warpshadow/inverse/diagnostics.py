@@ -9,12 +9,8 @@ import numpy as np
 import torch
 
 from warpshadow import check
+from warpshadow.inverse.free import Exposure, Pose
 from warpshadow.inverse.free.base import Values
-from warpshadow.inverse.free.emission import Emission
-from warpshadow.inverse.free.light import Light
-from warpshadow.inverse.free.pose import Pose
-from warpshadow.inverse.free.reflectance import Albedo, Texture
-from warpshadow.inverse.free.views import Exposure
 from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
@@ -94,7 +90,7 @@ def warn_of(
     problem: Problem, context: FitContext, values: Mapping[str, Values], stage: Stage, losses: Sequence[float], end: str
 ) -> None:
     """Warn of reasons to doubt a result."""
-    is_exposure_known = problem.basis is None and not problem.free_of(Exposure)
+    is_exposure_known = problem.light is None and not problem.free_of(Exposure)
     has_coverage = problem.targets[0].image.shape[2] == 4
     model = Model(problem, context, small_stage(problem))
     with torch.no_grad():
@@ -103,7 +99,7 @@ def warn_of(
     is_doubted |= is_exposure_known and _warn_of_exposures(model, images)
     gain = gain_of_last(losses)
     is_falling = end == "finished" and gain > MAX_LAST_GAIN
-    if is_falling and problem.basis is not None:
+    if is_falling and problem.light is not None:
         is_doubted = True
         check.warn(
             f"light has not converged: the loss still fell by {gain:.1%} over the last {_WINDOW // 2} iterations; "
@@ -128,7 +124,7 @@ def warn_before(problem: Problem) -> None:
             DiagnosticWarning,
         )
     poses = {pose.number for pose in problem.free_of(Pose)}
-    textures = [texture.number for texture in problem.free_of(Texture) if not texture.palette]
+    textures = [surface.number for surface in problem.free_of_bodies if surface.paints_shadows]
     names = [body.name for body in problem.scene.bodies]
     for texture in textures if len(problem.targets) == 1 else ():
         if moved := sorted(poses - {texture}):
@@ -146,18 +142,21 @@ def _free_factors(problem: Problem) -> dict[str, str]:
     The exposure is one; the light, where all that shines is free; and the reflectance of the bodies that cameras see,
     where that of all is free, and neither gloss, lamps that are seen nor bounces, where it counts twice, tell it.
     """
-    scene, cameras, names = problem.scene, problem.cameras(), {free.name for free in problem.free}
+    scene, cameras = problem.scene, problem.cameras()
+    lit, reflecting = (
+        {free.number for free in problem.free_of_bodies if free.scales == factor} for factor in ("light", "reflectance")
+    )
     seen = {k: b for k, b in enumerate(scene.bodies) if not all(is_out_of_frame(b, camera) for camera in cameras)}
-    is_map_known = Light.key not in names and np.any(scene.known_light.radiance)
-    lamps = [number for number, body in enumerate(scene.bodies) if body.is_emitter and np.any(body.emission)]
-    is_light_free = not is_map_known and {Emission(lamp).name for lamp in lamps} <= names
+    is_map_known = problem.light is None and np.any(scene.known_light.radiance)
+    lamps = {number for number, body in enumerate(scene.bodies) if body.is_emitter and np.any(body.emission)}
+    is_light_free = not is_map_known and lamps <= lit
     is_determined = scene.bounces or any(body.is_glossy or body.is_emitter for body in seen.values())
     factors = {
         "light": is_light_free and "",
-        "exposure": any(exposure.reference is None for exposure in problem.free_of(Exposure))
+        "exposure": any(free.scales == "exposure" for free in problem.free)
         and "leave out Exposure(), or of several views keep one's, Exposure(reference=0)",
         "the reflectance of all bodies": not is_determined
-        and all({Albedo(number).name, Texture(number).name} & names for number in seen)
+        and set(seen) <= reflecting
         and "leave out the Albedo or Texture of a body that is known",
     }
     return {name: remedy for name, remedy in factors.items() if remedy is not False}

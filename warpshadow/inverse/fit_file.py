@@ -15,18 +15,8 @@ from warpshadow.assets.image import image_size
 from warpshadow.check import AnyPath
 from warpshadow.inverse.descent import default_optimizer, fit, short_adam
 from warpshadow.inverse.encoding import is_curve_file
-from warpshadow.inverse.free.base import Free
-from warpshadow.inverse.free.emission import Emission
-from warpshadow.inverse.free.gloss import Metallic, Roughness
-from warpshadow.inverse.free.lamp import Lamp
-from warpshadow.inverse.free.light import Light
-from warpshadow.inverse.free.plane import Plane
-from warpshadow.inverse.free.pose import Pose
-from warpshadow.inverse.free.reflectance import Albedo, Texture
-from warpshadow.inverse.free.shape import Deformation, Radii
-from warpshadow.inverse.free.shell import Shell
-from warpshadow.inverse.free.sun import Sun
-from warpshadow.inverse.free.views import CameraPose, Exposure, OutlineOffset
+from warpshadow.inverse.free import FREE
+from warpshadow.inverse.free.base import Free, FreeOfBody
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import QuasiNewton
@@ -42,13 +32,6 @@ from warpshadow.scene.visibility import Visibility
 _KEYS = ("scene", "tolerance", "seed", "stages", "target", "free", "loss", "still", "optimizer", "stage")
 _PHOTOGRAPH_KEYS = ("encoding", "exposure", "white_balance", "saturation", "moves_outlines", "distortion")
 _TARGET_KEYS = ("image", "mask", "camera", "outlines", *_PHOTOGRAPH_KEYS)
-_FREE_OF_SCENE: dict[str, type[Free]] = {
-    kind.key: kind for kind in (Light, Sun, Shell, Exposure, CameraPose, OutlineOffset)
-}
-_FREE_OF_BODIES: dict[str, type[Free]] = {
-    kind.key: kind for kind in (Albedo, Texture, Roughness, Metallic, Emission, Lamp, Pose, Plane, Deformation, Radii)
-}
-
 
 _OPTIMIZERS: dict[str, tuple[Callable[..., torch.optim.Optimizer], dict[str, Callable[[str, object], Any]]]] = {
     "quasi-newton": (QuasiNewton, {}),
@@ -139,7 +122,7 @@ def _fit(table: Table, folder: Path) -> Fit:
     with check.located("[still]"):
         toml_tables.check_table(table.get("still", {}))
         still = toml_tables.make(Visibility, {"method": "ray-traced"} | table.get("still", {}))
-    problem = Problem(scene, targets, _free(table["free"], scene), loss, still)
+    problem = Problem(scene, targets, _free(table["free"], scene, len(targets)), loss, still)
     _check_framing(toml_tables.file(table, "scene", folder), problem)
     with check.located("[optimizer]"):
         optimizer = _optimizer(table.get("optimizer", {}))
@@ -169,7 +152,7 @@ def _target(table: Table, folder: Path) -> Target:
 
 def _check_framing(path: Path, problem: Problem) -> None:
     """Warn of a camera that stands where the start is framed: images of other poses are framed otherwise."""
-    moving = [item for item in problem.free if isinstance(item, (Pose, Deformation))]
+    moving = [free for free in problem.free_of_bodies if free.reframes]
     is_framed = "framing" in toml_tables.read(path, "scene file")["camera"]
     if not (is_framed and moving and any(target.camera is None for target in problem.targets)):
         return
@@ -186,29 +169,27 @@ def _check_framing(path: Path, problem: Problem) -> None:
     )
 
 
-def _free(table: Table, scene: Scene) -> list[Free]:
+def _free(table: Table, scene: Scene, view_count: int) -> list[Free]:
     with check.located("[free]"):
         toml_tables.check_table(table)
-        check.known_keys("", table, (*_FREE_OF_SCENE, *_FREE_OF_BODIES))
+        check.known_keys("", table, [kind.key for kind in FREE])
     free: list[Free] = []
-    for key, kind in _FREE_OF_SCENE.items():
-        entry = table.get(key, False)
-        if entry is False:
-            continue
-        with check.located(f"[free] {key}"):
-            settings = {} if entry is True else entry
-            toml_tables.check_table(settings)
-            if kind is Light and "directions" in settings:
-                settings = {"order": None} | settings  # in place of the default
-            free.append(toml_tables.make(kind, settings))
-    for key, kind in _FREE_OF_BODIES.items():
-        if isinstance(table.get(key), bool):
+    for kind in FREE:
+        key, entry = kind.key, table.get(kind.key, False)
+        if not issubclass(kind, FreeOfBody):
+            if entry is not False:
+                with check.located(f"[free] {key}"):
+                    settings = {} if entry is True else entry
+                    toml_tables.check_table(settings)
+                    free.append(toml_tables.make(kind, settings))
+        elif isinstance(table.get(key), bool):
             lines = f'[[free.{key}]]\nbody = "{scene.bodies[0].name}"'
-            raise ValueError(f"[free] {key}: got {str(table[key]).lower()}, expected a table for each body:\n{lines}")
-        for where, value in toml_tables.numbered({key: []} | table, key, "free."):
-            with check.located(where):
-                free.append(toml_tables.make(kind, value).numbered(scene))
-                free[-1].check_scene(scene)
+            raise ValueError(f"[free] {key}: got {str(entry).lower()}, expected a table for each body:\n{lines}")
+        else:
+            for where, value in toml_tables.numbered({key: []} | table, key, "free."):
+                with check.located(where):
+                    free.append(toml_tables.make(kind, value).numbered(scene))
+                    free[-1].check_scene(scene, view_count)
     return free
 
 

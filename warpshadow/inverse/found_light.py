@@ -21,8 +21,8 @@ from warpshadow.assets.known_light import as_light
 from warpshadow.assets.light import KnownLightArgument
 from warpshadow.assets.picture import Picture
 from warpshadow.inverse.diagnostics import small_stage
+from warpshadow.inverse.free import Light
 from warpshadow.inverse.free.base import Values
-from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.world import FitContext
@@ -94,7 +94,7 @@ def found_light(
 
 def influence_of_cells(problem: Problem, context: FitContext, values: Mapping[str, Values]) -> np.ndarray:
     """Find the influence of each of 512 cells' light on the images, 1 on average, shape [cell]."""
-    cells = Light(None, directions=_CELLS)
+    cells = Light(directions=_CELLS)
     free = [cells if isinstance(item, Light) else item for item in problem.free]
     by_cells = Problem(problem.scene, problem.targets, free, problem.loss, problem.still)
     model = Model(by_cells, context, small_stage(problem))

@@ -134,14 +134,8 @@ class Loss:
 
 
 def clip_saturated(images: torch.Tensor, targets: torch.Tensor, saturated: torch.Tensor | None) -> torch.Tensor:
-    """Images to compare with targets: no brighter than these where they are saturated, and so lower bounds.
-
-    Args:
-        images: [view, height, width, 4].
-        targets: [view, height, width, 3 or 4].
-        saturated: Bool of shape [view, height, width, 3]; None for nowhere.
-
-    Differentiable: images, below the bounds.
+    """Images [view, height, width, 4] to compare with targets: no brighter than these where they are saturated
+    [view, height, width, 3], None for nowhere, and so lower bounds. Differentiable: images, below the bounds.
     """
     if saturated is None:
         return images

@@ -7,12 +7,10 @@ from dataclasses import replace
 import torch
 
 from warpshadow.inverse.free.base import Values
-from warpshadow.inverse.free.light import Light
 from warpshadow.inverse.loss import clip_saturated
-from warpshadow.inverse.outlines import outlines_of
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
-from warpshadow.inverse.target import stack_targets
+from warpshadow.inverse.target import outlines_of, stack_targets
 from warpshadow.inverse.world import FitContext, World
 from warpshadow.torch import TorchRenderer
 
@@ -45,7 +43,7 @@ class Model:
         is_coarse = stage.scale < 1 and sample_count < _SEEN_VERTICES * vertex_count
         if self.problem.moves and is_coarse:  # of samples and vertices, the fewer are shaded
             scene = replace(scene, bodies=tuple(replace(body, receivers="pixel") for body in scene.bodies))
-        return TorchRenderer(scene, device=self.context.device, basis=self.problem.image_basis, cameras=self.cameras)
+        return TorchRenderer(scene, device=self.context.device, basis=self.problem.basis, cameras=self.cameras)
 
     def world(self, values: Mapping[str, Values]) -> World:
         """The world with values in it."""
@@ -97,9 +95,8 @@ class LightModel(Model):
 
     def __init__(self, problem: Problem, context: FitContext, stage: Stage):
         super().__init__(problem, context, stage)
-        (light,) = problem.free
-        assert isinstance(light, Light)
-        self.light = light
+        assert problem.light is not None
+        self.light = light = problem.light
         roots = problem.loss.pixel_shares(self.weights).sqrt()[..., None] / context.unit
         with torch.no_grad():
             black_image = self.renderer(torch.zeros(light.basis.size, 3, device=context.device))
@@ -119,9 +116,9 @@ class LightModel(Model):
     @staticmethod
     def applies(problem: Problem) -> bool:
         """Whether a problem is one of light alone, and of squares."""
-        is_light = len(problem.free) == 1 and isinstance(problem.free[0], Light)
+        is_alone = problem.light is not None and len(problem.free) == 1
         is_plain = all(target.saturated is None and not target.outlines for target in problem.targets)
-        return is_light and is_plain and problem.loss.kind == "l2"
+        return is_alone and is_plain and problem.loss.kind == "l2"
 
     def _images_of_units(self) -> list[torch.Tensor]:
         """Images by lights with one coefficient of 1 each, [view, height, width, 4]."""

@@ -15,15 +15,8 @@ from warpshadow import check
 from warpshadow.assets.basis import Basis
 from warpshadow.assets.camera import Camera
 from warpshadow.check import AnyPath
-from warpshadow.inverse.free.base import Free, Values
-from warpshadow.inverse.free.lamp import Lamp
-from warpshadow.inverse.free.light import Light
-from warpshadow.inverse.free.plane import with_planes_last
-from warpshadow.inverse.free.pose import Pose
-from warpshadow.inverse.free.reflectance import Albedo, Texture
-from warpshadow.inverse.free.shape import Deformation, Radii
-from warpshadow.inverse.free.sun import Sun
-from warpshadow.inverse.free.views import Exposure
+from warpshadow.inverse.free import Light
+from warpshadow.inverse.free.base import Free, FreeOfBody, Values
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import FitContext, FittedScene
@@ -84,7 +77,9 @@ class Problem:
             check.instance(f"targets[{number}]", target, Target, "a Target, as Target(image) makes it, or an image")
         for number, item in enumerate(self.free):
             check.instance(f"free[{number}]", item, Free, "a free parameter, such as Pose(0) or Light()")
-        object.__setattr__(self, "free", with_planes_last(tuple(self._numbered())))
+        numbered = list(self._numbered())
+        free = sorted((item.beside(numbered) for item in numbered), key=lambda item: item.moves_last)
+        object.__setattr__(self, "free", tuple(free))
         self._check_combinations()
         if self.still is not None:
             object.__setattr__(self, "still", self.still.with_method())
@@ -97,7 +92,7 @@ class Problem:
             )
         for number, item in enumerate(self.free):
             with check.located(f"free[{number}]"):
-                item.check_scene(self.scene)
+                item.check_scene(self.scene, len(self.targets))
         for number, target in enumerate(self.targets):
             for outlined in target.outlines:
                 self.scene.body_number(outlined, f"targets[{number}].outlines")
@@ -121,16 +116,11 @@ class Problem:
         twice = [name for name in names if names.count(name) > 1]
         if twice:
             raise ValueError(f"free: got {twice[0]} twice, expected it once")
-        if {Light.key, Sun.key} <= set(names):
-            raise ValueError("free: got Light and Sun, expected one of them: free light has any sun in it")
-        for exposure in self.free_of(Exposure):
-            if exposure.reference is not None:
-                check.index("reference", exposure.reference, len(self.targets), "view")
-        for body in range(len(self.scene.bodies)):
-            if {Albedo(body).name, Texture(body).name} <= set(names):
-                raise ValueError(f"free: got Albedo({body}) and Texture({body}), expected one of them for a body")
-            if {Lamp(body).name, Pose(body).name} <= set(names):
-                raise ValueError(f"free: got Lamp({body}) and Pose({body}), expected one of them for a body")
+        for free in self.free:
+            for key, reason in free.excludes.items():
+                excluded = free.name.replace(free.key, key, 1)  # of the same body
+                if excluded in names:
+                    raise ValueError(f"free: got {excluded} and {free.name}, expected one of them: {reason}")
 
     def _as_targets(self) -> Iterator[Target]:
         for number, item in enumerate(self.targets):
@@ -149,6 +139,11 @@ class Problem:
         return [item for item in self.free if isinstance(item, kind)]
 
     @property
+    def free_of_bodies(self) -> list[FreeOfBody]:
+        """The free parameters of bodies."""
+        return [item for item in self.free if isinstance(item, FreeOfBody)]
+
+    @property
     def moves(self) -> bool:
         """Whether geometry or cameras are free."""
         return any(free.moves for free in self.free)
@@ -157,22 +152,20 @@ class Problem:
     def visibility(self) -> Visibility:
         """Visibility settings of the fit."""
         visibility = self.scene.visibility if self.moves or self.still is None else self.still
-        suns = self.free_of(Sun)
-        if not suns or visibility.method != "directional":
+        min_directions = max(free.min_directions for free in self.free)
+        if not min_directions or visibility.method != "directional":
             return visibility
-        # fewer cells than the sun has would move it: by 3° of 128
-        return replace(visibility, directions=max(self.scene.direction_count, suns[0].directions))
+        return replace(visibility, directions=max(self.scene.direction_count, min_directions))
+
+    @property
+    def light(self) -> Light | None:
+        """The free light; None where it is known."""
+        return next(iter(self.free_of(Light)), None)
 
     @property
     def basis(self) -> Basis | None:
-        """Basis of free light."""
-        return next((light.basis for light in self.free_of(Light)), None)
-
-    @property
-    def image_basis(self) -> Basis | None:
         """Basis of the light of its images: of free light, or of a sun beside the map; None for the scene's own."""
-        bases = [light.basis for light in self.free_of(Light)] + [sun.basis for sun in self.free_of(Sun)]
-        return bases[0] if bases else None
+        return next((free.basis for free in self.free if free.basis is not None), None)
 
     def cameras(self) -> list[Camera]:
         """Camera of each target."""
@@ -186,7 +179,7 @@ class Problem:
         if scene.visibility.method in SPHERE_METHODS:  # another one would leave the found scene without its blockers
             spheres = scene_blockers(scene, device=str(device), progress=progress)
             # bodies that block light as planes do so in the scene that is found, too
-            reshaped = {free.number for free in (*self.free_of(Deformation), *self.free_of(Radii))}
+            reshaped = {free.number for free in self.free_of_bodies if free.reshapes}
             numbers = set(range(len(spheres))) - (set(blocking_planes(scene)) - reshaped)
             scene = change_bodies(scene, "blockers", {number: spheres[number] for number in numbers})
         color = np.stack([target.image[..., :3] for target in self.targets]).astype(np.float64)

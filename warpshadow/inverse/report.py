@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.assets import files
@@ -23,6 +22,7 @@ from warpshadow.inverse.model import Model, torch_on_one_thread
 from warpshadow.inverse.result import Result
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.uncertainty import MAX_POSE_UNCERTAINTY
+from warpshadow.inverse.world import format_numbers
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
 from warpshadow.scene.body import Body
@@ -156,16 +156,12 @@ _OTHER_FILES = ("light", "target", "before", "after", "loss", "preview", "parame
 """Files of a fit whose suffixes bodies' files have, too."""
 
 
-def _format_numbers(values: ArrayLike) -> str:
-    return ", ".join(f"{value:.4g}" for value in np.ravel(values))
-
-
 def _describe_shift(before: Body, after: Body) -> str:
     """How far the middle of a body moved: a translation is of the origin of its mesh, maybe far from it."""
     low, high = (corner.astype(np.float64) for corner in before.mesh.bounds)
     middle = (low + high) / 2
     shift = after.to_world(middle) - before.to_world(middle)
-    return f" scene units, its middle moved by ({_format_numbers(shift)})"
+    return f" scene units, its middle moved by ({format_numbers(shift)})"
 
 
 def found_values(result: Result) -> list[str]:
@@ -180,18 +176,13 @@ def found_values(result: Result) -> list[str]:
                 and values.size <= 3
             ):
                 remark = {"rotation": "°", "translation": _describe_shift(before, after)}.get(name, "")
-                rows.append((f"{after.name} {name}", f"({_format_numbers(values)}){remark}"))
+                rows.append((f"{after.name} {name}", f"({format_numbers(values)}){remark}"))
     if scene.light is not start.light:
         radiance = scene.known_light.radiance
         directions = sh.equirectangular_directions(len(radiance)).astype(np.float32)
         x, y, z = directions.reshape(-1, 3)[radiance.sum(axis=2).argmax()]
         rows.append(("light", f"strongest from ({x:.3f}, {y:.3f}, {z:.3f})"))
-    for name, value in result.found.sun.items():
-        rows.append((f"sun {name}", f"({_format_numbers(value)}){'°' if name == 'angular_radius' else ''}"))
-    if scene.shell is not None and start.shell is not None and scene.shell[3] != start.shell[3]:
-        rows.append(("light radius", f"{scene.shell[3]:.4g} scene units"))
-    if any(factor != 1 for factor in result.found.exposures):
-        rows.append(("exposure", f"{_format_numbers(np.log2(result.found.exposures))} stops"))
+    rows += [row for free in result.problem.free for row in free.report(result.context, result.found)]
     width = max((len(name) for name, _ in rows), default=0)
     return [f"{name:{width}}  {text}" for name, text in rows]
 

@@ -59,7 +59,7 @@ class Result:
     @functools.cached_property
     def light(self) -> FoundLight | None:
         """The light that was found, and which directions of it the images determined; None where it was not free."""
-        if self.problem.basis is None:
+        if self.problem.light is None:
             return None
         return found_light(self.scene.light, self.problem, self.context, self.values)
 

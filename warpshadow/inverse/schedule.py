@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from warpshadow import check
-from warpshadow.inverse.free.lamp import STARTS, Lamp
 from warpshadow.inverse.problem import Problem
 from warpshadow.maths.directions import check_count
 from warpshadow.scene.scene import check_supersampling
@@ -110,7 +109,7 @@ def check_stages(stages: Sequence[Stage], problem: Problem) -> None:
     visibility = problem.visibility
     for number, stage in enumerate(stages):
         check.instance(f"stages[{number}]", stage, Stage, "a Stage, such as Stage(iterations=200)")
-        if stage.solves_light and problem.basis is None:
+        if stage.solves_light and problem.light is None:
             raise ValueError(f"stages[{number}]: got solves_light where light is not free, expected Light among free")
         if stage.solves_light and all(free.is_light for free in problem.free):
             raise ValueError(
@@ -172,10 +171,11 @@ def photograph_stages(problem: Problem) -> tuple[Stage, ...]:
             Stage(20, 0.03, side[64], candidates=2, **first),
             Stage(20, 0.01, side[160], **first),
         ]
-    solved_settings: dict[str, Any] = {"solves_light": problem.basis is not None, "supersampling": 1}
-    if problem.basis is not None and problem.free_of(Lamp):
+    solved_settings: dict[str, Any] = {"solves_light": problem.light is not None, "supersampling": 1}
+    places = max(free.relocation_count for free in problem.free)
+    if problem.light is not None and places:
         stages.append(
-            Stage(6, 0.1, side[32], candidates=1 + STARTS, scatter="lamps", tolerance=0.01, **solved_settings)
+            Stage(6, 0.1, side[32], candidates=1 + places, scatter="lamps", tolerance=0.01, **solved_settings)
         )
     scatter = "flat" if has_outlines else "turned"
     return (

@@ -1,4 +1,4 @@
-"""Targets: the images that a fit explains."""
+"""Targets: the images that a fit explains, and outlines in them, painted by hand or by a segmentation."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,9 +13,9 @@ from warpshadow.assets.camera import Camera
 from warpshadow.assets.lens import checked_distortion, undistorted
 from warpshadow.assets.picture import development
 from warpshadow.check import AnyPath
-from warpshadow.inverse.edges import edge_offset, moved_outline
+from warpshadow.inverse.edges import edge_offset, moved_outline, signed_distances
 from warpshadow.inverse.encoding import Encoding, checked_encoding, decoded, guess_encoding, read_linear, read_mask
-from warpshadow.scene.scene import BodyLike
+from warpshadow.scene.scene import BodyLike, Scene
 
 
 @check.frozen()
@@ -223,3 +223,42 @@ def area_means(count: int, coarse_count: int) -> torch.Tensor:
     ends = np.minimum(edges[1:], coarse_edges[1:, None])
     starts = np.maximum(edges[:-1], coarse_edges[:-1, None])
     return torch.from_numpy((np.maximum(ends - starts, 0) * (coarse_count / count)).astype(np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """The outlines of all targets at the size of a stage."""
+
+    views: tuple[int, ...]  # of each outline, [outline]
+    bodies: tuple[int, ...]
+    distances: torch.Tensor  # signed [pixels of the targets], positive inside, [outline, height, width]
+    scale: float  # pixels of the stage in one of the targets
+
+    def differences(self, masks: torch.Tensor, offsets: torch.Tensor | None) -> torch.Tensor:
+        """Masks of bodies [view, body, height, width] minus outlines, moved outwards by offsets [view] [pixels of the
+        targets], [outline, height, width]. Differentiable: masks, offsets.
+        """
+        distances = self.distances
+        if offsets is not None:
+            distances = distances + offsets[list(self.views)][:, None, None]
+        return masks[list(self.views), list(self.bodies)] - (0.5 + self.scale * distances).clamp(0, 1)
+
+    def loss(self, masks: torch.Tensor, offsets: torch.Tensor | None) -> torch.Tensor:
+        """Mean square of the differences, summed over outlines. Differentiable: masks, offsets."""
+        return self.differences(masks, offsets).square().mean(dim=(1, 2)).sum()
+
+
+def outlines_of(targets: Sequence[Target], scene: Scene, scale: float, device: torch.device) -> Outlines | None:
+    """The outlines of targets; None where they have none."""
+    painted_outlines = [
+        (view, scene.body_number(body, "outlines"), mask)
+        for view, target in enumerate(targets)
+        for body, mask in target.outlines.items()
+    ]
+    if not painted_outlines:
+        return None
+    views, bodies, masks = zip(*painted_outlines, strict=True)
+    distances = np.stack([signed_distances(mask) for mask in masks])
+    height_means, width_means = (area_means(count, max(1, round(count * scale))) for count in distances.shape[1:])
+    small_distances = torch.einsum("ih,ohw,jw->oij", height_means, torch.from_numpy(distances), width_means)
+    return Outlines(views, bodies, small_distances.contiguous().to(device), scale)

@@ -17,11 +17,8 @@ import numpy as np
 import torch
 
 from warpshadow.inverse.diagnostics import small_stage
+from warpshadow.inverse.free import Plane, Pose
 from warpshadow.inverse.free.base import PRIOR, Values
-from warpshadow.inverse.free.light import Light
-from warpshadow.inverse.free.plane import Plane
-from warpshadow.inverse.free.pose import Pose
-from warpshadow.inverse.free.views import OutlineOffset
 from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
@@ -51,6 +48,7 @@ class PoseUncertainty:
         least_turn: Turn beside it [degrees].
         along_view: Part of the shift that is along the view, 0 to 1.
         diagonal: Of the body's bounding box [scene units].
+        remark: How it stands, if that was assumed: deviations do not know of it.
     """
 
     shift: np.ndarray
@@ -59,6 +57,7 @@ class PoseUncertainty:
     least_turn: float
     along_view: float
     diagonal: float
+    remark: str = ""
 
     @property
     def is_flat(self) -> bool:
@@ -71,7 +70,8 @@ class PoseUncertainty:
         direction_text = (
             "along the view" if self.along_view > 0.9 else f"along {np.round(self.least / max(length, 1e-12), 2)}"
         )
-        return f"known least: ±{length:.2g} {direction_text}, turned by ±{self.least_turn:.2g}°"
+        text = f"known least: ±{length:.2g} {direction_text}, turned by ±{self.least_turn:.2g}°"
+        return f"{text}; it {self.remark}" if self.remark else text
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ class NormalMatrix:
         self.problem, self.context = problem, context
         self.values = {name: {key: t.detach().clone() for key, t in parts.items()} for name, parts in values.items()}
         stage = small_stage(problem)
-        self.model = (ProjectedModel if problem.free_of(Light) else Model)(problem, context, stage)
+        self.model = (ProjectedModel if problem.light else Model)(problem, context, stage)
         self.parameter_entries = _few_number_entries(problem, self.values)
         self.directions = self._directions()
         self.roots: list[torch.Tensor] = []  # of the weights of colors, and of coverage
@@ -244,7 +244,7 @@ class NormalMatrix:
         return float(np.sqrt(variance) / total) if total > 0 else 0.0
 
     def _prior(self) -> np.ndarray:
-        """Precision that priors have, [number, number]: the curvature of regularizers of poses, planes and offsets."""
+        """Precision that priors have, [number, number]: the curvature of their regularizers."""
         rows = []
         for name, key, number in self.parameter_entries:
             ends = []
@@ -256,13 +256,13 @@ class NormalMatrix:
         return np.reshape(rows, (len(rows), len(rows))) / (2 * PRIOR)
 
     def _prior_slopes(self) -> np.ndarray:
-        """Derivatives of the regularizers of poses, planes and offsets by the numbers, [number]."""
+        """Derivatives of the regularizers that are priors by the numbers, [number]."""
         leaves = {
             name: {key: t.clone().requires_grad_() for key, t in parts.items()} for name, parts in self.values.items()
         }
         total = torch.zeros(())
         for free in self.problem.free:
-            if isinstance(free, (Pose, Plane, OutlineOffset)):
+            if free.has_prior:
                 term = free.regularizer(leaves[free.name], self.context)
                 total = total if term is None else total + term
         if total.requires_grad:
@@ -318,6 +318,7 @@ def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) 
         float(np.degrees(np.linalg.norm(weakest_direction[3:]) / half)),
         view_share,
         2 * half,
+        free.constraint(context).remark,
     )
 
 
@@ -343,7 +344,7 @@ def _few_number_entries(problem: Problem, values: Mapping[str, Values]) -> list[
 
     Light is projected out: that of a map, and beside it that of lamps, whose emission is then left out here.
     """
-    light_names = {free.name for free in problem.free if free.is_light and problem.basis is not None}
+    light_names = {free.name for free in problem.free if free.is_light and problem.light}
     return [
         (name, key, number)
         for name, parts in values.items()

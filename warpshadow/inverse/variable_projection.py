@@ -19,9 +19,9 @@ import numpy as np
 import torch
 
 from warpshadow.assets.basis import CellBasis
+from warpshadow.inverse.free import Emission, Light
 from warpshadow.inverse.free.base import Values
-from warpshadow.inverse.free.emission import Emission
-from warpshadow.inverse.free.light import Light, neighboring_cells
+from warpshadow.inverse.free.light import neighboring_cells
 from warpshadow.inverse.model import LightModel, Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
@@ -40,7 +40,8 @@ class ProjectedModel(Model):
 
     def __init__(self, problem: Problem, context: FitContext, stage: Stage):
         super().__init__(problem, context, stage)
-        (self.light,) = problem.free_of(Light)
+        assert problem.light is not None
+        self.light = problem.light
         self.atoms = atoms(self.light)
         self.lamps = [emission for emission in problem.free_of(Emission) if emission.is_light]
         self.lamp_units = np.ones(len(self.lamps))  # emission that lights an image as much as an atom does
@@ -149,9 +150,7 @@ def atoms(light: Light) -> np.ndarray:
 def nonnegative_least_squares(form: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """The x ≥ 0 of the least xᵀ F x − 2 sᵀ x [Lawson and Hanson 1974, on a square root of F].
 
-    Args:
-        form: F, symmetric and positive semidefinite, [n, n]; directions in which it is about 0 get a ridge.
-        slope: s, [n].
+    The form F is symmetric and positive semidefinite, [n, n]; directions in which it is about 0 get a ridge.
     """
     from scipy.optimize import nnls
 

@@ -15,8 +15,6 @@ import torch
 
 from warpshadow import check
 from warpshadow.assets.color import auto_exposure, srgb_to_linear
-from warpshadow.assets.image import write_image
-from warpshadow.check import AnyPath
 from warpshadow.device.progress import in_ipython
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
@@ -102,18 +100,10 @@ def losses_by_stage(losses: Sequence[list[float]], descents: Sequence[int]) -> l
     return [list(islice(runs, count)) for count in descents]
 
 
-def write_preview(path: AnyPath, targets: torch.Tensor, images: torch.Tensor) -> None:
-    """Write a picture of targets, images and differences; see :func:`side_by_side`."""
-    write_image(path, side_by_side(targets, images))
-
-
 def side_by_side(targets: torch.Tensor, images: torch.Tensor) -> np.ndarray:
     """Targets, images and differences (gray where equal), a row for each view: linear RGB, 0 to 1.
 
-    Args:
-        targets, images: Linear RGB, [view, height, width, 3 or more].
-    Returns:
-        Shape [view · height, 3 · width, 3].
+    Of [view, height, width, 3 or more] both, to [view · height, 3 · width, 3].
     """
     target, got = targets[..., :3].cpu().numpy(), images[..., :3].cpu().numpy()
     white = 2.0 ** -auto_exposure(target)

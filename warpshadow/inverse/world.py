@@ -22,6 +22,11 @@ from warpshadow.torch import TorchRenderer
 T = TypeVar("T")
 
 
+def format_numbers(values: ArrayLike) -> str:
+    """Numbers as reports have them."""
+    return ", ".join(f"{value:.4g}" for value in np.ravel(values))
+
+
 class FitContext:
     """Shared by all stages of a fit: the scene at the start and the units of its parameters.
 

@@ -15,7 +15,7 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.image import ImageError
 from warpshadow.assets.known_light import KnownLight, as_light
-from warpshadow.assets.light import LIGHT, EnvironmentMap, KnownLightArgument, check_coefficients
+from warpshadow.assets.light import KNOWN_LIGHTS, LIGHT, EnvironmentMap, KnownLightArgument, check_coefficients
 from warpshadow.assets.mesh import Mesh
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
@@ -106,7 +106,7 @@ def _argument_role(value: object, name: str) -> str:
     items = value if isinstance(value, (list, tuple)) else [value]
     if any(isinstance(item, Body) for item in items):
         return "bodies"
-    roles = {EnvironmentMap: "light", Camera: "camera", Visibility: "visibility"}
+    roles = dict.fromkeys(KNOWN_LIGHTS, "light") | {Camera: "camera", Visibility: "visibility"}
     return next((role for kind, role in roles.items() if isinstance(value, kind)), name)
 
 
@@ -214,7 +214,7 @@ class Scene:
             path = check.file("light", value)
             with check.located("light", ImageError):
                 object.__setattr__(self, "light", EnvironmentMap.read(path))
-        if not isinstance(self.light, EnvironmentMap):
+        if not isinstance(self.light, KNOWN_LIGHTS):
             light = check.numbers("light", self.light, expected=f"{LIGHT}, or the path of a map")
             check_coefficients("light", light)
             with check.located("light"):

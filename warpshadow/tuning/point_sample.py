@@ -120,11 +120,7 @@ class PointSample:
         return np.einsum("pk,pkc->pc", receivers.weights, shading[receivers.corners])
 
     def receivers(self, of_bodies: Sequence[str]) -> PointReceivers:
-        """Find where light is evaluated.
-
-        Args:
-            of_bodies: Receivers of each body: at "vertex" points are interpolated, else they are receivers themselves.
-        """
+        """Find where light is evaluated, by the receivers of each body: at "vertex" its points are interpolated."""
         is_receiver = np.array([receivers != "vertex" for receivers in of_bodies])[self.bodies]
         receiver_rows, weights, corners = places_of_receivers(self._vertices, self._weights, is_receiver)
         points, normals = (
@@ -147,10 +143,8 @@ class PointSample:
 
 
 def seen_on_faces(view: View, chosen_samples: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions on faces of samples of a view's first image.
+    """Positions on faces of samples of a view's first image, by their flat indices [point].
 
-    Args:
-        chosen_samples: Flat indices of samples that see a face, shape [point].
     Returns:
         Faces, after the last of which backs are numbered, [point]; their vertices, or the backs of these, numbered
         likewise, [point, 3]; and barycentric coordinates, [point, 3].
@@ -165,11 +159,8 @@ def seen_on_faces(view: View, chosen_samples: np.ndarray) -> tuple[np.ndarray, n
 def places_of_receivers(
     vertices: np.ndarray, barycentrics: np.ndarray, is_receiver: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the receivers of points: vertices of the faces that they lie on, or the points themselves.
+    """Find the receivers of points of :func:`seen_on_faces`: the points themselves or vertices of their faces.
 
-    Args:
-        vertices, barycentrics: Of the points, from :func:`seen_on_faces`.
-        is_receiver: Points that are receivers themselves, bool of shape [point].
     Returns:
         A point on whose face each receiver lies, shape [receiver]; where on it, shape [receiver, 3]; and the receivers
         of each point, shape [point, 3].

@@ -77,8 +77,10 @@ def median_times(
     """
     times: list[list[float]] = [[] for _ in functions]
     turns = range(runs * len(functions))
-    with progress_bar(len(turns), "timing", "call", shows=progress) as bar:
+    with progress_bar(len(turns), "timing, kernels to be compiled", "call", shows=progress) as bar:
         for turn in turns:
+            if turn == len(functions):  # all are compiled: from here on the time that is left can be told
+                bar.describe("timing")
             function = functions[turn % len(functions)]
             function()
             wp.synchronize()

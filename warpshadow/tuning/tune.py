@@ -9,7 +9,6 @@ import contextlib
 import itertools
 import math
 import os
-import sys
 import warnings
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.progress import progress_bar
+from warpshadow.device.progress import progress_bar, remark
 from warpshadow.device.threads import locked
 from warpshadow.scene import toml_tables
 from warpshadow.scene.blockers import fitted_counts, fitted_meshes
@@ -147,13 +146,6 @@ def _columns(scene: Scene, fitted: Iterable[int]) -> str:
     return f"{columns}  {_join_words(_receivers(scene)):16}"
 
 
-def _error_table(settings: Sequence[Scene], errors: Sequence[float], fitted: Iterable[int]) -> str:
-    """Errors of settings, a line each, the smallest first."""
-    permutation = np.argsort(errors, kind="stable")
-    lines = [f"{_columns(settings[number], fitted)}{errors[number]:8.2%}" for number in permutation]
-    return "\n".join([f"{_HEAD}{'error':>8}", *lines])
-
-
 def describe(scene: Scene) -> str:
     """Name the settings of a scene in a few words."""
     spheres = f", {_spheres(scene, fitted_counts(scene))} spheres" if scene.visibility.method in SPHERE_METHODS else ""
@@ -215,7 +207,7 @@ def tune(
             too, as far as there are so many, and "all". By default the scene's, which are not varied.
         fits: Whether to fit as many spheres as are tried, some 20 s a body; otherwise only the scene's own number is
             tried, and others whose fits are cached already.
-        progress: Show progress, and all errors before anything is timed.
+        progress: Show progress, and each error as it is measured: an interrupted run has these.
     Returns:
         The choice, and all trials. If no setting reaches the target, it is the nearest. Settings that miss an error are
         not timed.
@@ -246,13 +238,16 @@ def tune(
     settings = [setting for item in scenes_with_bounces for setting in _trial_scenes(item, fine, fits, device)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a setting's warnings show in its error
-        errors = [0.0] * len(settings)
-        with progress_bar(len(settings), "measuring errors, before times", "setting", shows=progress) as bar:
-            for number in np.random.default_rng(0).permutation(len(settings)).tolist():  # slow ones come last otherwise
+        errors, fitted = [0.0] * len(settings), fitted_counts(scene)
+        order, compiling_count = _measuring_order(settings)
+        remark(f"{_HEAD}{'error':>8}", shows=progress)
+        with progress_bar(len(settings), "compiling kernels, measuring errors", "setting", shows=progress) as bar:
+            for place, number in enumerate(order):
+                if place == compiling_count:
+                    bar.describe("measuring errors, before times")
                 errors[number] = sample.error(sample.shading(settings[number]))
+                remark(f"{_columns(settings[number], fitted)}{errors[number]:8.2%}", shows=progress)
                 bar.update()
-        if progress:  # timing takes as long again, and may be interrupted
-            print(_error_table(settings, errors, fitted_counts(scene)), file=sys.stderr)
         limit = max(error, _nearest_limit(errors)) if error is not None else math.inf
         timed_numbers = [number for number, item in enumerate(errors) if item <= limit]
         timed_settings = [settings[number] for number in timed_numbers]
@@ -286,6 +281,18 @@ def _fine_receivers(scene: Scene, sample: PointSample) -> list[str]:
         body.receivers if receivers == receivers_chosen or body.is_glossy else receivers
         for body, receivers_chosen, receivers in zip(scene.bodies, chosen, fine, strict=True)
     ]
+
+
+def _measuring_order(settings: Sequence[Scene]) -> tuple[list[int], int]:
+    """Numbers of settings, and how many of them come first since they compile kernels; the others have an even pace."""
+    permutation = np.random.default_rng(0).permutation(len(settings)).tolist()  # slow ones come last otherwise
+    firsts: dict[object, int] = {}
+    for number in permutation:
+        visibility = replace(settings[number].visibility, directions=None)
+        kernels = *vars(visibility).values(), _receivers(settings[number]), settings[number].bounces != 0
+        firsts.setdefault(kernels, number)
+    compiling = list(firsts.values())
+    return [*compiling, *(number for number in permutation if number not in compiling)], len(compiling)
 
 
 def _time_front(

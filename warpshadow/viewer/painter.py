@@ -156,7 +156,7 @@ class Painter:
         return key, self._renderers.get(key, lambda: Renderer(scene, device=self._device, progress=self._progress))
 
     def _gloss(self, viewer_state: ViewerState, device: wp.Device) -> dict[str, Any]:
-        """Roughness and metallic of the bodies that have others than in the scene, as arguments of an image."""
+        """Gloss of the bodies that have other numbers than in the scene, as arguments of an image."""
         arguments: dict[str, Any] = {}
         for number, body in enumerate(self.scene.bodies):
             for name, value in viewer_state.changed_gloss(body, number).items():

@@ -18,7 +18,7 @@ from warpshadow.viewer.loop import Loop
 from warpshadow.viewer.page_camera import PAGE_RADIUS, quaternion
 from warpshadow.viewer.painter import Painter, picture
 from warpshadow.viewer.saving import as_archive, as_toml, saved_camera
-from warpshadow.viewer.state import AS_GIVEN, ERROR, PICTURE, BodyGloss, BodyPose, ViewerState
+from warpshadow.viewer.state import AS_GIVEN, ERROR, PICTURE, BodyPose, ViewerState
 
 _NOTHING = "nothing"
 _CELLS = (16, 32, 64, 128, 256, 512)
@@ -96,23 +96,23 @@ class Panel:
     def _add_gloss(self) -> None:
         """Sliders of the bodies that shine, in the scene, by one number."""
         gui, of_bodies = self._server.gui, self._loop.viewer_state.gloss
-        if not any(gloss.arguments() for gloss in of_bodies):
+        if not any(of_bodies):
             return
         with gui.add_folder("Gloss"):
             for number, gloss in enumerate(of_bodies):
-                for name, value in gloss.arguments().items():
+                for name, value in gloss.items():
                     label = f"{self._scene.bodies[number].name}: {name}"
                     self._bind_gloss(gui.add_slider(label, 0.0, 1.0, 0.01, value), number, name)
 
     def _bind_gloss(self, slider: Any, number: int, name: str) -> None:
         """Change a number of a body's gloss when a page moves its slider."""
 
-        def read(value: float) -> tuple[BodyGloss, ...]:
+        def read(value: float) -> tuple[dict[str, float], ...]:
             of_bodies = [*self._loop.viewer_state.gloss]
-            of_bodies[number] = dataclasses.replace(of_bodies[number], **{name: value})
+            of_bodies[number] = of_bodies[number] | {name: value}
             return tuple(of_bodies)
 
-        self._bind(slider, "gloss", lambda of_bodies: getattr(of_bodies[number], name), read)
+        self._bind(slider, "gloss", lambda of_bodies: of_bodies[number][name], read)
 
     def _add_bodies(self) -> None:
         gui = self._server.gui

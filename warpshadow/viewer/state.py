@@ -12,6 +12,7 @@ from warpshadow.assets.light import KnownLightArgument
 from warpshadow.maths.directions import check_count
 from warpshadow.scene.body import RECEIVERS, Body
 from warpshadow.scene.files import turned_light
+from warpshadow.scene.material import GLOSS_ARGUMENTS, GLOSS_DEFAULTS
 from warpshadow.scene.scene import Bounces, Scene, check_bounces
 from warpshadow.scene.visibility import (
     BOUNCE_METHODS,
@@ -45,34 +46,13 @@ class BodyPose:
             object.__setattr__(self, name, tuple(values.tolist()))
 
 
-@dataclass(frozen=True)
-class BodyGloss:
-    """Gloss of a body that shines, None where it has none, or one that varies over it.
-
-    Args:
-        roughness, metallic: Numbers from 0 to 1.
-    """
-
-    roughness: float | None = None
-    metallic: float | None = None
-
-    def __post_init__(self) -> None:
-        """Check it."""
-        for name, value in vars(self).items():
-            if value is not None:
-                within(name, value, 0, 1)
-
-    @classmethod
-    def of(cls, body: Body) -> BodyGloss:
-        """That of a body; one without a metallic number has 0."""
-        if body.roughness is None:
-            return cls()
-        arrays = body.roughness, np.zeros(1) if body.metallic is None else body.metallic
-        return cls(*(float(str(array[0])) if array.size == 1 else None for array in arrays))
-
-    def arguments(self) -> dict[str, float]:
-        """The numbers that there are, by name."""
-        return {name: value for name, value in vars(self).items() if value is not None}
+def gloss_of(body: Body) -> dict[str, float]:
+    """Numbers of a body's gloss, by name; none of a diffuse body, nor any that vary over it."""
+    if not body.is_glossy:
+        return {}
+    values = {name: getattr(body, name) for name in GLOSS_ARGUMENTS}
+    arrays = {name: np.full(1, GLOSS_DEFAULTS[name]) if value is None else value for name, value in values.items()}
+    return {name: float(str(array[0])) for name, array in arrays.items() if array.size == 1}
 
 
 @dataclass(frozen=True)
@@ -92,7 +72,7 @@ class ViewerState:
     shows: str  # PICTURE or ERROR
     shows_light: bool  # whether the light itself is behind the bodies
     poses: tuple[BodyPose, ...]  # of the bodies
-    gloss: tuple[BodyGloss, ...]  # of the bodies
+    gloss: tuple[dict[str, float], ...]  # of the bodies: the numbers that there are, by name, 0 to 1
 
     def __post_init__(self) -> None:
         """Check it."""
@@ -117,7 +97,9 @@ class ViewerState:
         for pose in self.poses:
             check.instance("poses", pose, BodyPose, "a Pose for each body")
         for gloss in self.gloss:
-            check.instance("gloss", gloss, BodyGloss, "a BodyGloss for each body")
+            check.instance("gloss", gloss, dict, "numbers by name, for each body")
+            for name, value in gloss.items():
+                within(name, value, 0, 1)
 
     @classmethod
     def of(cls, scene: Scene, stops: float = 0.0) -> ViewerState:
@@ -136,7 +118,7 @@ class ViewerState:
             shows=PICTURE,
             shows_light=False,
             poses=tuple(BodyPose(tuple(body.rotation), tuple(body.translation)) for body in scene.bodies),
-            gloss=tuple(map(BodyGloss.of, scene.bodies)),
+            gloss=tuple(map(gloss_of, scene.bodies)),
         )
 
     def visibility(self, visibility: Visibility, quality: Quality | None = None) -> Visibility:
@@ -199,11 +181,9 @@ class ViewerState:
         return dataclasses.replace(settings, bodies=bodies, light=self.light(scene.light))
 
     def changed_gloss(self, body: Body, number: int) -> dict[str, float]:
-        """Roughness and metallic of a body that are not as it has them, by name."""
-        scene_numbers = BodyGloss.of(body).arguments()
-        return {
-            name: value for name, value in self.gloss[number].arguments().items() if value != scene_numbers.get(name)
-        }
+        """Numbers of a body's gloss that are not as it has them, by name."""
+        scene_numbers = gloss_of(body)
+        return {name: value for name, value in self.gloss[number].items() if value != scene_numbers.get(name)}
 
     def has_moved(self, scene: Scene) -> bool:
         """Whether a body is not where the scene has it."""

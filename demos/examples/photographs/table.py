@@ -29,7 +29,7 @@ from demos.problems import changed, displaced, distance_error, placement
 from warpshadow import inverse
 from warpshadow.maths.sh import equirectangular_directions, pixel_solid_angles
 
-LIGHT = inverse.Light(None, directions=64)
+LIGHT = inverse.Light(directions=64)
 LAMP = ws.Body(
     ws.icosphere(0.4, 2), emission=(20, 20, 20), albedo=(0, 0, 0), blockers=0, translation=(0, 6, 0), name="lamp"
 )

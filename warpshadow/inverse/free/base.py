@@ -1,9 +1,9 @@
-"""Base classes: a free parameter, and a free parameter of one body."""
+"""Base classes: a free parameter, and a free parameter of one body, with all that other files ask of one."""
 
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from warpshadow import check
+from warpshadow.assets.basis import Basis
 from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.scene.scene import BodyLike, Scene
 
@@ -21,13 +22,25 @@ PRIOR = 1e-3
 
 
 class Free(abc.ABC):
-    """A free parameter of a scene."""
+    """A free parameter of a scene. Fits ask it alone: no other file has a list of classes."""
 
     key: ClassVar[str]
     """Its name in fit files."""
 
     moves: ClassVar[bool] = False
     """Whether geometry or cameras change with it."""
+
+    moves_last: ClassVar[bool] = False
+    """Whether it moves bodies that others have placed, and so comes after them."""
+
+    excludes: ClassVar[Mapping[str, str]] = {}
+    """Keys of parameters, of the same body, that cannot be free beside it, and why."""
+
+    has_prior: ClassVar[bool] = False
+    """Whether its regularizer is a prior, which counts as a measurement in uncertainties."""
+
+    relocation_count: ClassVar[int] = 0
+    """Number of places from which a search for it starts, see :meth:`relocated`."""
 
     @property
     def shows_in_outlines(self) -> bool:
@@ -40,6 +53,21 @@ class Free(abc.ABC):
         return False
 
     @property
+    def basis(self) -> Basis | None:
+        """Basis of the light that images have by it; None where it leaves them the scene's."""
+        return None
+
+    @property
+    def min_directions(self) -> int:
+        """Cells of directional visibility that it needs."""
+        return 0
+
+    @property
+    def scales(self) -> str:
+        """Factor of images that it may be: "light", "reflectance", "exposure" or "", none of these."""
+        return ""
+
+    @property
     def name(self) -> str:
         """Its name in values and messages."""
         return self.key
@@ -48,9 +76,13 @@ class Free(abc.ABC):
         """Replace the name of its body by the number; ValueError where a scene has no such body."""
         return self
 
-    def check_scene(self, scene: Scene) -> None:
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         """Raise ValueError if the scene's value cannot be free; the message names the argument."""
         return
+
+    def beside(self, others: Sequence[Free]) -> Free:
+        """The parameter as it is beside all that are free, itself among them; ValueError where it cannot be."""
+        return self
 
     @abc.abstractmethod
     def start(self, context: FitContext) -> Values:
@@ -70,6 +102,10 @@ class Free(abc.ABC):
         """
         return {key: tensor.detach().clone() for key, tensor in values.items()}
 
+    def relocated(self, values: Values, context: FitContext, number: int) -> Values:
+        """Values in another of the places from which a search starts; equal ones where there are none."""
+        return {key: tensor.detach().clone() for key, tensor in values.items()}
+
     @abc.abstractmethod
     def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         """Write final values into the fitted scene."""
@@ -77,6 +113,10 @@ class Free(abc.ABC):
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
         """The fitted numbers by their keys in scene files, if they are few."""
         return {}
+
+    def report(self, context: FitContext, fitted: FittedScene) -> list[tuple[str, str]]:
+        """Lines of a report, name and value, beside those of the fields of bodies that changed."""
+        return []
 
     def regularizer(self, values: Values, context: FitContext) -> torch.Tensor | None:
         """Regularizer, to be added to the loss; None for none. Differentiable: values."""
@@ -95,6 +135,12 @@ class FreeOfBody(Free):
         body: The body, its number or name.
     """
 
+    reframes: ClassVar[bool] = False
+    """Whether a camera that is framed on the bodies would stand elsewhere by it."""
+
+    reshapes: ClassVar[bool] = False
+    """Whether the spheres of its body change by it, even if it blocks light as a plane."""
+
     body: BodyLike
 
     def __post_init__(self) -> None:
@@ -112,6 +158,20 @@ class FreeOfBody(Free):
     def name(self) -> str:
         """Its name in values and messages."""
         return f"{self.key}[{self.body}]"
+
+    @property
+    def paints_shadows(self) -> bool:
+        """Whether the surface may keep a shadow that was never there."""
+        return False
+
+    @property
+    def body_figures(self) -> tuple[str, ...]:
+        """Fields of its body that are a few numbers and change with it."""
+        return ()
+
+    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
+        body = fitted.scene.bodies[self.number]
+        return {f"{self.called(fitted)}.{name}": getattr(body, name) for name in self.body_figures}
 
     def called(self, fitted: FittedScene) -> str:
         """The name of its body, or its number if the name is not unique."""

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.inverse.free.base import Values
@@ -30,15 +28,16 @@ class Emission(FreeOfSurface):
 
     key = "emission"
     value_key = "radiance"
+    scales = "light"
 
     @property
     def is_light(self) -> bool:
         """Images are linear in it; one color is solved for, numbers of many vertices are descended to."""
         return self.is_one
 
-    def check_scene(self, scene: Scene) -> None:
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         check_emits(scene, self.number)
-        super().check_scene(scene)
+        super().check_scene(scene, view_count)
 
     def _unit(self, context: FitContext) -> float:
         """Radiance that counts as 1: a lamp is far brighter than its image."""
@@ -59,10 +58,6 @@ class Emission(FreeOfSurface):
     def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         radiance = (values["radiance"] * self._unit(context)).cpu().numpy()
         fitted.change_body(self.number, emission=radiance[0] if self.is_one else radiance)
-
-    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        emission = fitted.scene.bodies[self.number].emission
-        return {f"{self.called(fitted)}.emission": emission} if self.is_one and emission is not None else {}
 
 
 def check_emits(scene: Scene, body: int) -> None:

@@ -1,11 +1,9 @@
 """Free gloss of a body: how rough it is, and how much of it is metal."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.inverse.free.base import Values
@@ -20,10 +18,10 @@ from warpshadow.stages.gloss.lobes import MIN_ROUGHNESS
 class _Gloss(FreeOfSurface):
     """A number of a body that shines, and has roughness in the scene; its values have no dimension of channels."""
 
-    def check_scene(self, scene: Scene) -> None:
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         if not scene.bodies[self.number].is_glossy:
             raise ValueError(f"body: got {self.number}, which is diffuse; expected one that has roughness")
-        super().check_scene(scene)
+        super().check_scene(scene, view_count)
 
     def rows(self, body: Body) -> np.ndarray:
         value = getattr(body, self.key)
@@ -45,10 +43,6 @@ class _Gloss(FreeOfSurface):
 
     def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         fitted.change_body(self.number, **{self.key: values["value"].cpu().numpy()})
-
-    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        value = getattr(fitted.scene.bodies[self.number], self.key)
-        return {f"{self.called(fitted)}.{self.key}": value[0]} if self.is_one else {}
 
 
 @check.frozen()

@@ -1,11 +1,9 @@
 """A free lamp: the place of a body that emits."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.inverse import constraints
@@ -14,8 +12,6 @@ from warpshadow.inverse.free.emission import check_emits
 from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.maths.directions import fibonacci
 from warpshadow.scene.scene import Scene
-
-STARTS = 8  # directions above the middle of a scene from which the search for a lamp starts
 
 _REACH = 4.0  # turn [radians], and logarithm of the distance, for a value of 1: a lamp moves farther than a pose
 
@@ -35,8 +31,11 @@ class Lamp(FreeOfBody):
     key = "lamp"
     shows_in_outlines = False
     moves = True
+    excludes = {"pose": "both place the body"}
+    relocation_count = 8  # directions above the middle of a scene
+    body_figures = ("translation", "scale")
 
-    def check_scene(self, scene: Scene) -> None:
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         check_emits(scene, self.number)
         if all(body.is_emitter for body in scene.bodies):
             raise ValueError(f"body: got {self.number} in a scene of lamps alone, expected another body that it lights")
@@ -68,16 +67,10 @@ class Lamp(FreeOfBody):
         return context.tensor(middle) + distance * factor * direction - scale * own_middle, scale
 
     def relocated(self, values: Values, context: FitContext, number: int) -> Values:
-        """The lamp in another direction above, as far away.
-
-        Args:
-            values: Of the lamp.
-            context: Of the fit.
-            number: Of the direction, 0 to STARTS − 1; they repeat.
-        """
+        """The lamp in another direction above, as far away; directions repeat."""
         _, start_direction, _ = self._start(context)
-        above = fibonacci(2 * STARTS)[:, [0, 2, 1]]
-        direction = above[above[:, 1] > 0][number % STARTS]
+        above = fibonacci(2 * self.relocation_count)[:, [0, 2, 1]]
+        direction = above[above[:, 1] > 0][number % self.relocation_count]
         sideways = constraints.perpendicular_basis([start_direction]) @ direction
         angle = np.arctan2(np.linalg.norm(sideways), direction @ start_direction)
         turn = angle / max(float(np.linalg.norm(sideways)), 1e-12) * sideways / _REACH
@@ -90,7 +83,3 @@ class Lamp(FreeOfBody):
     def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
         translation, scale = (part.cpu().numpy() for part in self._placed(values, context))
         fitted.change_body(self.number, translation=translation, scale=float(scale))
-
-    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        body = fitted.scene.bodies[self.number]
-        return {f"{self.called(fitted)}.{name}": getattr(body, name) for name in ("translation", "scale")}

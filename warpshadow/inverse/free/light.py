@@ -17,6 +17,7 @@ from warpshadow.scene.scene import Scene
 
 # light of cells starts no lower [radiance of the targets]: a logarithm has to come back from there
 _MIN_RADIANCE = 1e-3
+_ORDER = 5  # of spherical harmonics, by default
 
 
 @check.frozen()
@@ -25,7 +26,7 @@ class Light(Free):
     """The light, in spherical harmonics or as a map of cells.
 
     Args:
-        order: Number of SH bands; None with ``directions``.
+        order: Number of SH bands; by default 5 without ``directions``.
         directions: In place of ``order`` the number of cells, whose radiance is the exponential of a value and so never
             negative: sharper light, and a longer way to it.
         nonnegativity: Weight of the mean square of negative radiance in spherical harmonics [targets' radiance].
@@ -35,29 +36,32 @@ class Light(Free):
 
     key = "light"
     is_light = True
+    scales = "light"
 
-    order: int | None = 5
+    order: int | None = None
     directions: int | None = None
     nonnegativity: float = 0.01
     smoothness: float = 1e-4
 
     def __post_init__(self) -> None:
-        if (self.order is None) == (self.directions is None):
+        if self.order is not None and self.directions is not None:
             raise ValueError(
                 f"order, directions: got {self.order!r} and {self.directions!r}, expected one of them, such as "
-                "Light(5) or Light(None, directions=512)"
+                "Light(5) or Light(directions=512)"
             )
         if self.directions is not None:
             check_count("directions", self.directions)
-        if self.order is not None:
+        elif self.order is None:
+            object.__setattr__(self, "order", _ORDER)
+        else:
             check_order(self.order)
         for name in ("nonnegativity", "smoothness"):
             check.nonnegative(name, getattr(self, name))
 
-    def check_scene(self, scene: Scene) -> None:
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         if scene.shell is not None and self.order is not None:
             raise ValueError(
-                f"order: got {self.order} for light that has a radius, expected cells: Light(None, directions=512)"
+                f"order: got {self.order} for light that has a radius, expected cells: Light(directions=512)"
             )
 
     @functools.cached_property

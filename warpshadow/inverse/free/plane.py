@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,6 +39,10 @@ class Plane(FreeOfBody):
 
     key = "plane"
     moves = True
+    moves_last = True
+    excludes = {"pose": "both place the body"}
+    has_prior = True
+    body_figures = ("rotation", "translation")
 
     height: float | None = None
     tilt: float | None = None
@@ -68,10 +72,18 @@ class Plane(FreeOfBody):
         carries = tuple(scene.body_number(body, "carries") for body in self.carries)
         return replace(self, body=scene.body_number(self.body), carries=carries)
 
-    def check_scene(self, scene: Scene) -> None:
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         constraints.plane_below(scene.bodies[self.number], np.zeros(3), "body")
         if self.number in self.carries:
             raise ValueError(f"carries: got {self.number}, the plane itself; expected bodies that stand on it")
+
+    def beside(self, others: Sequence[Free]) -> Plane:
+        """The plane that carries all bodies whose free poses stand on it."""
+        poses = [pose for pose in others if isinstance(pose, Pose) and pose.stands_on == self.number]
+        for pose in poses:
+            if pose.distance is not None:
+                raise ValueError(f"{pose.name}: got a distance beside a free {self.name}, expected priors of the plane")
+        return replace(self, carries=tuple(sorted({*self._moving()[1:], *(pose.number for pose in poses)})))
 
     def _moving(self) -> list[int]:
         """The bodies that move: itself, and all that it carries."""
@@ -142,29 +154,3 @@ class Plane(FreeOfBody):
             start = context.tensor(body.rotation_matrix()), context.tensor(body.translation)
             rotation, translation = (part.cpu().numpy() for part in self.moved(values, context, *start))
             fitted.change_body(number, rotation=rotation, translation=translation)
-
-    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        body = fitted.scene.bodies[self.number]
-        return {f"{self.called(fitted)}.{name}": getattr(body, name) for name in ("rotation", "translation")}
-
-
-def with_planes_last(free: Sequence[Free]) -> tuple[Free, ...]:
-    """Free parameters of bodies' numbers in the order in which they move bodies; planes carry bodies that stand on
-    them.
-
-    Raises:
-        ValueError: for a prior of the distance of a body whose plane moves, and for a plane whose pose is free, too.
-    """
-    planes = []
-    for plane in (item for item in free if isinstance(item, Plane)):
-        standing_poses = [pose for pose in free if isinstance(pose, Pose) and pose.stands_on == plane.number]
-        for pose in standing_poses:
-            if pose.distance is not None:
-                raise ValueError(
-                    f"{pose.name}: got a distance beside a free {plane.name}, expected priors of the plane"
-                )
-        if any(isinstance(pose, Pose) and pose.number == plane.number for pose in free):
-            raise ValueError(f"{plane.name}: got a free pose of the same body, expected one of them")
-        carried_bodies = {*plane._moving()[1:], *(pose.number for pose in standing_poses)}
-        planes.append(replace(plane, carries=tuple(sorted(carried_bodies))))
-    return (*(item for item in free if not isinstance(item, Plane)), *planes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +26,7 @@ _TURNS = np.array(
 
 
 _MAX_TILT = 1.0  # degrees from the nearest stable support up to which a body stands as the scene has it
+_MAX_GAP = 1e-3  # part of a body's diagonal by which it may be off a plane that it touches
 
 
 @check.frozen()
@@ -42,7 +43,8 @@ class Pose(FreeOfBody):
         stands_on: A flat body, its number or name, that the body touches from above; three degrees of freedom stay.
         resting: How it stands: "stable", turned onto the support of its convex hull that needs the least turn, if by
             more than 1°; "given", as the scene has it; "free", any way, so that five degrees of freedom stay. Its
-            height always follows.
+            height always follows. By default "given" for a body that touches the plane in the scene, as
+            :meth:`.Body.on_ground` places it, without a prior of its tilt; else "stable".
         tilt: Prior of its tilt from there about each of two axes, a standard deviation [radians]: five degrees of
             freedom stay. For scans: their bases are uneven, so a stable one is the plane nearest to all of the base.
         upright: Whether it turns about the world's y alone.
@@ -58,12 +60,14 @@ class Pose(FreeOfBody):
 
     key = "pose"
     moves = True
+    reframes = True
+    has_prior = True
 
     rotation: str = "axis-angle"
     scale: bool = False
     spread: float = 0.55
     stands_on: BodyLike | None = None
-    resting: str = "stable"
+    resting: str | None = None
     tilt: float | None = None
     upright: bool = False
     axis: Sequence[float] | None = None
@@ -82,7 +86,8 @@ class Pose(FreeOfBody):
         self._check_priors()
 
     def _check_constraints(self) -> None:
-        check.choice("resting", self.resting, constraints.RESTING)
+        if self.resting is not None:
+            check.choice("resting", self.resting, constraints.RESTING)
         check.flag("upright", self.upright)
         if isinstance(self.fixed, str) or not isinstance(self.fixed, Sequence):
             raise ValueError(f'fixed: got {check.described(self.fixed)}, expected a list of coordinates, such as ["y"]')
@@ -122,7 +127,7 @@ class Pose(FreeOfBody):
             return numbered_pose
         return replace(numbered_pose, stands_on=scene.body_number(self.stands_on, "stands_on"))
 
-    def check_scene(self, scene: Scene) -> None:
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         if self.stands_on is None:
             return
         ground = scene.body_number(self.stands_on, "stands_on")
@@ -148,11 +153,34 @@ class Pose(FreeOfBody):
             turns = plane.normal[None]
         if self.tilt is not None:
             turns = np.concatenate([turns, constraints.perpendicular_basis([plane.normal])])
-        if self.resting == "stable":
-            rotation = _stable_rotation(body, plane, is_scan=self.tilt is not None)
+        remark = ""
+        if self.resting in ("stable", None):
+            rotation, remark = self._resting_rotation(body, plane, context)
         shifts = constraints.perpendicular_basis([plane.normal, *fixed_axes])
         onto = constraints.onto_plane(plane.normal, self.fixed)
-        return PoseConstraint(turns, shifts, rotation, plane, onto, constraints.hull_points(body.mesh))
+        return PoseConstraint(turns, shifts, rotation, plane, onto, constraints.hull_points(body.mesh), remark)
+
+    def _resting_rotation(
+        self, body: Body, plane: constraints.PlaneConstraint, context: FitContext
+    ) -> tuple[np.ndarray, str]:
+        """The rotation in which a body stands, its own or that of its stable support, and a remark if they differ."""
+        from scipy.spatial.transform import Rotation
+
+        start, is_scan = body.rotation_matrix(), self.tilt is not None
+        rotation = constraints.stable_rotation(body.mesh, start, plane.normal, base_is_uneven=is_scan)
+        angle = np.degrees(Rotation.from_matrix(rotation @ start.T).magnitude())
+        if angle <= _MAX_TILT:
+            return (rotation if is_scan else start), ""
+        diagonal = 2 * body.scale * context.extent(self.number)
+        gap = float((body.world_points() @ plane.normal).min()) - plane.offset
+        if self.resting is None and not is_scan and abs(gap) < _MAX_GAP * diagonal:
+            rotation, remark = start, f"stands {angle:.2g}° off its stable support"
+            remedy = 'resting = "stable" turns it there'
+        else:
+            remark = f"was turned by {angle:.2g}° onto its stable support"
+            remedy = 'resting = "given" keeps it as in the scene'
+        check.warn(f"{body.name} {remark}; {remedy}")
+        return rotation, remark
 
     def start(self, context: FitContext) -> Values:
         possible = self.constraint(context)
@@ -235,10 +263,13 @@ class Pose(FreeOfBody):
         rotation, translation, scale = (part.cpu().numpy() for part in self._posed(values, context))
         fitted.change_body(self.number, rotation=rotation, translation=translation, scale=float(scale))
 
-    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        body = fitted.scene.bodies[self.number]
-        names = ("rotation", "translation", "scale") if self.scale else ("rotation", "translation")
-        return {f"{self.called(fitted)}.{name}": getattr(body, name) for name in names}
+    def report(self, context: FitContext, fitted: FittedScene) -> list[tuple[str, str]]:
+        remark = self.constraint(context).remark
+        return [(self.called(fitted), remark)] if remark else []
+
+    @property
+    def body_figures(self) -> tuple[str, ...]:
+        return ("rotation", "translation", "scale") if self.scale else ("rotation", "translation")
 
 
 def _rotation_vector(matrix: torch.Tensor) -> torch.Tensor:
@@ -247,19 +278,3 @@ def _rotation_vector(matrix: torch.Tensor) -> torch.Tensor:
     length = (sine.square().sum() + 1e-20).sqrt()
     angle = torch.atan2(length, (matrix.trace() - 1) / 2)
     return sine * (angle / length)
-
-
-def _stable_rotation(body: Body, plane: constraints.PlaneConstraint, *, is_scan: bool) -> np.ndarray:
-    """The rotation in which a body rests on a plane: its own if that nearly is one, else a warning says the turn."""
-    from scipy.spatial.transform import Rotation
-
-    start = body.rotation_matrix()
-    rotation = constraints.stable_rotation(body.mesh, start, plane.normal, base_is_uneven=is_scan)
-    angle = np.degrees(Rotation.from_matrix(rotation @ start.T).magnitude())
-    if angle <= _MAX_TILT:
-        return rotation if is_scan else start
-    check.warn(
-        f"{body.name}: its stable support differs from the scene's pose by {angle:.2g}°, by which it is turned; "
-        'resting = "given" keeps it'
-    )
-    return rotation

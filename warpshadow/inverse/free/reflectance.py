@@ -1,12 +1,10 @@
 """Free reflectance of a body: its colors or its texture."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 
 from warpshadow import check
 from warpshadow.inverse.free.base import FreeOfBody, Values
@@ -89,7 +87,11 @@ class FreeOfSurface(FreeOfBody):
         """Whether one value is free, for the whole body."""
         return not self.per_vertex and self.size is None
 
-    def check_scene(self, scene: Scene) -> None:
+    @property
+    def body_figures(self) -> tuple[str, ...]:
+        return (self.key,) if self.is_one else ()
+
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         if self.size is not None:
             check_uvs(self.number, scene)
         elif self.per_vertex and self.rows(scene.bodies[self.number]).ndim == 3:
@@ -129,6 +131,7 @@ class Albedo(FreeOfBody):
     """
 
     key = "albedo"
+    scales = "reflectance"
 
     per_vertex: bool = False
 
@@ -136,7 +139,11 @@ class Albedo(FreeOfBody):
         super().__post_init__()
         check.flag("per_vertex", self.per_vertex)
 
-    def check_scene(self, scene: Scene) -> None:
+    @property
+    def body_figures(self) -> tuple[str, ...]:
+        return () if self.per_vertex else (self.key,)
+
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         if scene.bodies[self.number].texture is not None:
             raise ValueError(f"body: got {self.number}, which has a texture; expected one without, or Texture")
 
@@ -157,10 +164,6 @@ class Albedo(FreeOfBody):
         color = values["color"].cpu().numpy()
         fitted.change_body(self.number, albedo=color if self.per_vertex else color[0])
 
-    def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
-        body = fitted.scene.bodies[self.number]
-        return {} if self.per_vertex else {f"{self.called(fitted)}.albedo": body.albedo}
-
 
 @check.frozen()
 @dataclass(frozen=True)
@@ -179,6 +182,8 @@ class Texture(FreeOfBody):
     """
 
     key = "texture"
+    scales = "reflectance"
+    excludes = {"albedo": "a texture takes its place"}
 
     size: tuple[int, int] | None = None
     smoothness: float = 0.0
@@ -194,7 +199,11 @@ class Texture(FreeOfBody):
             check.nonnegative(name, getattr(self, name))
         check.integer("colors", self.colors, minimum=2)
 
-    def check_scene(self, scene: Scene) -> None:
+    @property
+    def paints_shadows(self) -> bool:
+        return not self.palette
+
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         check_uvs(self.number, scene)
 
     def start(self, context: FitContext) -> Values:

@@ -45,6 +45,8 @@ class Deformation(FreeOfBody):
 
     key = "deformation"
     moves = True
+    reframes = True
+    reshapes = True
 
     rigidity: float = 1.25
     firmness: float = 0.001
@@ -57,7 +59,7 @@ class Deformation(FreeOfBody):
             check.nonnegative(name, getattr(self, name))
         check.integer("count", self.count, unit="nodes")
 
-    def check_scene(self, scene: Scene) -> None:
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         nodes = _sphere_count(scene.bodies[self.number])
         if self.count >= nodes:
             raise ValueError(f"count: got {self.count} for {nodes} nodes, the body's spheres, expected fewer than them")
@@ -117,6 +119,7 @@ class Radii(FreeOfBody):
 
     key = "radii"
     moves = True
+    reshapes = True
 
     persistence: float = 0.0
 
@@ -124,7 +127,7 @@ class Radii(FreeOfBody):
         super().__post_init__()
         check.nonnegative("persistence", self.persistence)
 
-    def check_scene(self, scene: Scene) -> None:
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         if scene.visibility.method not in SPHERE_METHODS or not _sphere_count(scene.bodies[self.number]):
             raise ValueError(f"body: got {self.number}, which has no spheres; expected one that casts a shadow")
 

@@ -31,7 +31,7 @@ class Shell(Free):
     shows_in_outlines = False
     moves = True  # rays, which lights alone may have, have no gradient to it
 
-    def check_scene(self, scene: Scene) -> None:
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         if scene.shell is None:
             raise ValueError(
                 "shell: got it for a scene whose light is infinitely far away, expected light of a radius: "
@@ -71,3 +71,7 @@ class Shell(Free):
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
         assert fitted.scene.shell is not None
         return {"light.radius": fitted.scene.shell[3]}
+
+    def report(self, context: FitContext, fitted: FittedScene) -> list[tuple[str, str]]:
+        assert fitted.scene.shell is not None
+        return [("light radius", f"{fitted.scene.shell[3]:.4g} scene units")]

@@ -13,7 +13,7 @@ from warpshadow.assets.basis import CellBasis
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.inverse import constraints
 from warpshadow.inverse.free.base import Free, Values
-from warpshadow.inverse.world import FitContext, FittedScene, World
+from warpshadow.inverse.world import FitContext, FittedScene, World, format_numbers
 from warpshadow.maths.directions import check_count, fibonacci
 from warpshadow.scene.scene import Scene
 
@@ -49,6 +49,7 @@ class Sun(Free):
     """
 
     key = "sun"
+    excludes = {"light": "free light has any sun in it"}
 
     direction: ArrayLike
     irradiance: ArrayLike
@@ -67,7 +68,7 @@ class Sun(Free):
         # tuples, which compare and print
         vars(self).update(direction=tuple(direction.tolist()), irradiance=tuple(strength.tolist()))
 
-    def check_scene(self, scene: Scene) -> None:
+    def check_scene(self, scene: Scene, view_count: int) -> None:
         if not isinstance(scene.light, EnvironmentMap):
             raise ValueError(
                 "sun: got it for light in spherical harmonics, expected a map, to which it is added: "
@@ -79,6 +80,11 @@ class Sun(Free):
     def basis(self) -> CellBasis:
         """The cells."""
         return CellBasis(fibonacci(self.directions))
+
+    @property
+    def min_directions(self) -> int:
+        """As many as it has: fewer would move it, by 3° of 128."""
+        return self.directions
 
     @property
     def _spacing(self) -> float:
@@ -147,6 +153,12 @@ class Sun(Free):
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:
         return {f"sun.{name}": value for name, value in fitted.sun.items()}
+
+    def report(self, context: FitContext, fitted: FittedScene) -> list[tuple[str, str]]:
+        units = {"angular_radius": "°"}
+        return [
+            (f"sun {name}", f"({format_numbers(value)}){units.get(name, '')}") for name, value in fitted.sun.items()
+        ]
 
 
 def _weights(direction: torch.Tensor, variance: torch.Tensor, cells: torch.Tensor) -> torch.Tensor:

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 from warpshadow import check
 from warpshadow.assets.camera import Camera
 from warpshadow.inverse.free.base import PRIOR, Free, Values
-from warpshadow.inverse.world import FitContext, FittedScene, World
+from warpshadow.inverse.world import FitContext, FittedScene, World, format_numbers
+from warpshadow.scene.scene import Scene
 from warpshadow.torch import rotation_matrices
 
 
@@ -34,6 +35,14 @@ class Exposure(Free):
         check.flag("white_balance", self.white_balance)
         if self.reference is not None:
             check.integer("reference", self.reference, minimum=0)
+
+    @property
+    def scales(self) -> str:
+        return "exposure" if self.reference is None else ""
+
+    def check_scene(self, scene: Scene, view_count: int) -> None:
+        if self.reference is not None:
+            check.index("reference", self.reference, view_count, "view")
 
     def start(self, context: FitContext) -> Values:
         views = len(context.cameras)
@@ -66,6 +75,9 @@ class Exposure(Free):
         figures: dict[str, ArrayLike] = {"exposure": fitted.exposures}
         return figures | ({"white_balance": fitted.white_balances} if self.white_balance else {})
 
+    def report(self, context: FitContext, fitted: FittedScene) -> list[tuple[str, str]]:
+        return [("exposure", f"{format_numbers(np.log2(fitted.exposures))} stops")]
+
 
 @check.frozen()
 @dataclass(frozen=True)
@@ -78,6 +90,7 @@ class OutlineOffset(Free):
 
     key = "outline_offset"
     shows_in_outlines = True
+    has_prior = True
 
     deviation: float = 1.0
 

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.assets.light import LIGHT, EnvironmentMap, KnownLightArgument, check_coefficients
+from warpshadow.assets.light import KNOWN_LIGHTS, LIGHT, KnownLightArgument, check_coefficients
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.stages.light.shading import shade
@@ -21,7 +21,7 @@ LARGEST_COEFFICIENT = 1e3 * check.LARGEST
 def check_light(light: object) -> None:
     """Raise ValueError for a value that is neither light nor None."""
     expected = f"{LIGHT}, or free coefficients in renderer.basis as a tensor"
-    check.instance("light", light, (EnvironmentMap, np.ndarray, wp.array, type(None)), expected)
+    check.instance("light", light, (*KNOWN_LIGHTS, np.ndarray, wp.array, type(None)), expected)
     if isinstance(light, np.ndarray):
         check_coefficients("light", light)
 
