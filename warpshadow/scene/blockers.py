@@ -8,9 +8,9 @@ import warp as wp
 
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.progress import ANNOUNCED_SECONDS, announce
+from warpshadow.maths.adjacency import solid_angles
 from warpshadow.maths.convex import ConvexPart, is_panel
 from warpshadow.maths.plane import plane_normal
-from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.body import Body, into_own_space
 from warpshadow.scene.height_fields import Land, solid_behind
 from warpshadow.scene.scene import Scene
