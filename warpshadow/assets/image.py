@@ -132,9 +132,14 @@ def write_image(path: AnyPath, pixels: np.ndarray | Picture, *, layers: Mapping[
         picture.write(path)
         return
     channels = _checked_layers(layers or {}, pixels)
+    import OpenEXR
+
     try:
         with files.atomic_write(path) as temporary_path:
-            _write_exr(temporary_path, pixels, channels)
+            name = _CHANNELS[pixels.shape[2]]
+            colors = np.ascontiguousarray(pixels if len(name) > 1 else pixels[..., 0])
+            exr = OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {name: colors, **channels})
+            exr.write(str(temporary_path))
     except RuntimeError as error:  # OpenEXR's, of a disk that is full
         raise OSError(f"{path}: {error}") from error
 
@@ -275,14 +280,6 @@ def _find_channels(names: list[str]) -> list[str]:
 
 
 _CHANNELS = {1: "Y", 3: "RGB", 4: "RGBA"}
-
-
-def _write_exr(path: Path, pixels: np.ndarray, layers: Mapping[str, np.ndarray]) -> None:
-    import OpenEXR
-
-    name = _CHANNELS[pixels.shape[2]]
-    pixels = np.ascontiguousarray(pixels if len(name) > 1 else pixels[..., 0])
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {name: pixels, **layers}).write(str(path))
 
 
 # ----------------------------------------------------------------------------------------- PNG, JPEG and TIFF
