@@ -34,7 +34,7 @@ def _count_outside(
     # out
     faults: wp.array(dtype=wp.int32),
 ):
-    """A thread owns a number of an array, of which there are the address and the count of numbers."""
+    """A thread owns a number of an array, which is given by its address and its count of numbers."""
     argument, item = wp.tid()
     if item < counts[argument]:
         values = wp.array(ptr=addresses[argument], shape=(counts[argument],), dtype=wp.float32)
