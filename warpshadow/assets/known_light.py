@@ -1,55 +1,18 @@
-"""Known light of any kind: all that the package asks of one, and a user's light as one by one function."""
+"""Known light of any kind: maps, and spherical harmonics with the members of a map that the package asks for."""
 
 from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 
 from warpshadow.assets.cells import CellLight
-from warpshadow.assets.light import KnownLightArgument
+from warpshadow.assets.light import EnvironmentMap, KnownLightArgument
 from warpshadow.maths import sh
 
 _ROWS = 64  # of maps of harmonics: the last of eight bands loses 0.5% to the size of a pixel
-
-
-class KnownLight(Protocol):
-    """Known light of any kind: all that the package asks of one, but for maps in files. Kinds compare by value."""
-
-    @property
-    def radiance(self) -> np.ndarray:
-        """The light as a map, linear RGB, [height, 2·height, 3]."""
-
-    @property
-    def shell(self) -> np.ndarray | None:
-        """Center and radius of the sphere that sends it, float32 of shape [4]; None for light infinitely far away."""
-
-    @property
-    def as_argument(self) -> KnownLightArgument:
-        """The light as scenes and renderers take it."""
-
-    def radiance_from(self, directions: np.ndarray) -> np.ndarray:
-        """Radiance from directions [..., 3], shape [..., 3]."""
-
-    def rotated(self, degrees: float) -> KnownLight:
-        """Turn the light about +y."""
-
-    def scaled(self, factor: float) -> KnownLight:
-        """Multiply the radiance by a factor."""
-
-    def coarsened(self, row_count: int) -> KnownLight:
-        """The light with as much detail as a map of some rows has."""
-
-    def bands(self, order: int) -> int:
-        """Number of SH bands, of some, in which there may be light."""
-
-    def sh(self, order: int) -> np.ndarray:
-        """SH coefficients of an order, float32 of shape [order², 3]."""
-
-    def cells(self, directions: np.ndarray) -> CellLight:
-        """The light in cells around directions [cell, 3]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +90,10 @@ class HarmonicLight:
         """The radiance in the middle of cells: no part of a cell is much brighter than the rest."""
         functions = sh.evaluate(sh.order_of("light", self.coefficients), directions)
         return CellLight((functions @ self.coefficients).astype(np.float32), directions, None, None)
+
+
+KnownLight: TypeAlias = EnvironmentMap | HarmonicLight
+"""Known light with its methods, of whichever kind it is: all kinds have the members of :class:`HarmonicLight`."""
 
 
 def as_light(light: KnownLightArgument) -> KnownLight:
