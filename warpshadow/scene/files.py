@@ -178,27 +178,21 @@ def _light(table: Table, folder: Path) -> KnownLightArgument:
         raise ValueError(f'{next(iter(shell))}: got it without envmap, expected envmap = "FILE" beside it')
     if "sh" in table and "sun" in table:
         raise ValueError("sun: got it beside sh, expected envmap or sky beside it, which hold one")
+    if "sh" in table:
+        coefficients = check.numbers("sh", table["sh"], expected="rows of 3 finite numbers", dtype=np.float64)
+        check.shape("sh", coefficients.shape, ("order²", 3), "rows of 3 finite numbers")
+        check.finite("sh", coefficients)
+        sh.order_of("sh", coefficients)
+        return turned_light(coefficients, rotation, scale)
     if "envmap" in table:
         envmap = EnvironmentMap.read(toml_tables.file(table, "envmap", folder), **shell)
-        return turned_light(_with_sun(envmap, table), rotation, scale)
-    if "sky" in table:
+    else:
         with check.located("sky"):
-            sky = toml_tables.make(synthetic_sky, table["sky"])
-        return turned_light(_with_sun(sky, table), rotation, scale)
-    coefficients = check.numbers("sh", table["sh"], expected="rows of 3 finite numbers", dtype=np.float64)
-    check.shape("sh", coefficients.shape, ("order²", 3), "rows of 3 finite numbers")
-    check.finite("sh", coefficients)
-    sh.order_of("sh", coefficients)
-    return turned_light(coefficients, rotation, scale)
-
-
-def _with_sun(envmap: EnvironmentMap, table: Table) -> EnvironmentMap:
-    """A map with the sun that a table may have."""
-    if "sun" not in table:
-        return envmap
-    with check.located("sun"):
-        toml_tables.check_table(table["sun"])
-        return toml_tables.make(envmap.with_sun, table["sun"])
+            envmap = toml_tables.make(synthetic_sky, table["sky"])
+    if "sun" in table:
+        with check.located("sun"):
+            envmap = toml_tables.make(envmap.with_sun, table["sun"])
+    return turned_light(envmap, rotation, scale)
 
 
 def turned_light(light: KnownLightArgument, rotation: float, scale: float) -> KnownLightArgument:
