@@ -120,7 +120,7 @@ def test_a_mirroring_turns_faces_over_so_that_normals_stay_outside():
 
 
 def test_a_transform_of_the_wrong_shape_is_refused():
-    with pytest.raises(ValueError, match=r"rotation: got shape \(2, 2\)"):
+    with pytest.raises(ValueError, match=r"rotation: got ndarray of float64 and shape \(2, 2\), expected 3 rows of 3"):
         plane(segments=1).transformed(rotation=np.eye(2))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpshadow.assets.harmonic_light import HarmonicLight
+from warpshadow.assets.known_light import HarmonicLight
 from warpshadow.device.constants import collecting_constants
 from warpshadow.device.tape import recorded
 from warpshadow.pipeline.explain import Explanation, decide_which_nodes_run

@@ -299,7 +299,7 @@ def test_moving_geometry_that_leaves_the_image_is_remarked_on():
 )
 def test_what_a_renderer_is_not_made_of_is_refused_when_it_is_made(options, message):
     with pytest.raises(ValueError, match=message):
-        SceneRenderer(**{"scene": scene_of("none")} | options)
+        ws.Renderer(**{"scene": scene_of("none")} | options)
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,7 @@ import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets.cells import spread_in_cells
-from warpshadow.assets.harmonic_light import HarmonicLight
-from warpshadow.assets.known_light import as_light
+from warpshadow.assets.known_light import HarmonicLight, as_light
 from warpshadow.assets.light import EnvironmentMap, KnownLightArgument
 from warpshadow.maths import sh
 from warpshadow.maths.directions import CHUNK, fibonacci

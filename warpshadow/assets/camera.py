@@ -14,7 +14,7 @@ Conventions (OpenCV, with pixel centers at +0.5):
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -341,7 +341,7 @@ class Camera:
         turn = Rotation.from_rotvec([0, check.number("degrees", degrees), 0], degrees=True).as_matrix()
         rotation = self.rotation @ turn.T
         translation = self.translation + (self.rotation - rotation) @ center
-        return Camera(self.intrinsics, rotation, translation, self.width, self.height, self.near)
+        return replace(self, rotation=rotation, translation=translation)
 
     def around(self, shown: Placed | Iterable[Placed] | HasBodies, count: int) -> list[Camera]:
         """Cameras for a turntable: this one, turned about the vertical through the center of the framed bodies.
@@ -358,13 +358,8 @@ class Camera:
         cameras = [self.turned(angle, center) for angle in angles]
         if self._missing_distance(points) > 1e-6 * np.ptp(points, axis=0).max():
             return cameras
-        back = np.array(
-            [0.0, 0.0, max(0.0, *(camera._missing_distance(points, margin=_TURNTABLE_MARGIN) for camera in cameras))]
-        )
-        return [
-            Camera(self.intrinsics, camera.rotation, camera.translation + back, self.width, self.height, self.near)
-            for camera in cameras
-        ]
+        distance = max(0.0, *(camera._missing_distance(points, margin=_TURNTABLE_MARGIN) for camera in cameras))
+        return [replace(camera, translation=camera.translation + (0.0, 0.0, distance)) for camera in cameras]
 
     def _missing_distance(self, points: np.ndarray, margin: float = 0.0) -> float:
         """Distance by which it must move back along the view to show all points; negative if it may move nearer."""
@@ -386,7 +381,7 @@ class Camera:
         """Stretch a view to an image of another size [pixels]; with other proportions, pixels are not square."""
         width, height = check.image_size((width, height))
         intrinsics = np.diag([width / self.width, height / self.height, 1.0]) @ self.intrinsics
-        return Camera(intrinsics, self.rotation, self.translation, width, height, self.near)
+        return replace(self, intrinsics=intrinsics, width=width, height=height)
 
     def clip_matrix(self) -> np.ndarray:
         """World to clip space (convention: see the module), float64, shape [4, 4]."""

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +46,7 @@ def load_cameras(
         result = {name: camera.stretched(*size) for name, camera in result.items()}
     if up == "y":
         return result
-    return {
-        name: Camera(c.intrinsics, c.rotation @ _TO_Y_UP.T, c.translation, c.width, c.height, c.near)
-        for name, c in result.items()
-    }
+    return {name: replace(camera, rotation=camera.rotation @ _TO_Y_UP.T) for name, camera in result.items()}
 
 
 def _read_transforms(path: Path, size: tuple[int, int] | None, near: float) -> dict[Path, Camera]:

@@ -18,10 +18,11 @@ from warpshadow.assets import files
 from warpshadow.assets.color import srgb_to_linear
 from warpshadow.assets.picture import SUFFIXES, Picture, development
 from warpshadow.assets.radiance import read_radiance
-from warpshadow.assets.raw import RAW_SUFFIXES, read_raw
 from warpshadow.check import AnyPath
 
 INTEGER_SUFFIXES = (*SUFFIXES, ".tif", ".tiff")  # suffixes of files of integers, which are taken for sRGB
+
+_RAW_SUFFIXES = (".dng", ".nef", ".cr2", ".cr3", ".crw", ".arw", ".orf", ".raf", ".rw2", ".pef", ".srw")
 
 
 class ImageError(ValueError):
@@ -131,9 +132,14 @@ def write_image(path: AnyPath, pixels: np.ndarray | Picture, *, layers: Mapping[
         picture.write(path)
         return
     channels = _checked_layers(layers or {}, pixels)
+    import OpenEXR
+
     try:
         with files.atomic_write(path) as temporary_path:
-            _write_exr(temporary_path, pixels, channels)
+            name = _CHANNELS[pixels.shape[2]]
+            colors = np.ascontiguousarray(pixels if len(name) > 1 else pixels[..., 0])
+            exr = OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {name: colors, **channels})
+            exr.write(str(temporary_path))
     except RuntimeError as error:  # OpenEXR's, of a disk that is full
         raise OSError(f"{path}: {error}") from error
 
@@ -276,14 +282,6 @@ def _find_channels(names: list[str]) -> list[str]:
 _CHANNELS = {1: "Y", 3: "RGB", 4: "RGBA"}
 
 
-def _write_exr(path: Path, pixels: np.ndarray, layers: Mapping[str, np.ndarray]) -> None:
-    import OpenEXR
-
-    name = _CHANNELS[pixels.shape[2]]
-    pixels = np.ascontiguousarray(pixels if len(name) > 1 else pixels[..., 0])
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {name: pixels, **layers}).write(str(path))
-
-
 # ----------------------------------------------------------------------------------------- PNG, JPEG and TIFF
 
 
@@ -380,10 +378,45 @@ def _load(picture: Any) -> None:
         raise ImageError(f"truncated or damaged ({error})") from error
 
 
+# ------------------------------------------------------------------------------------------------- raw files
+
+
+def _read_raw(path: Path, check_size: Callable[[int, int], None]) -> np.ndarray:
+    """Develop a raw file linearly: no tone curve, no brightening, upright, in the primaries of sRGB.
+
+    The white balance is the camera's, or that of daylight where the file has none.
+
+    Args:
+        check_size: Raises ValueError for a width and height that are too large.
+    Returns:
+        RGB, 1 where the sensor saturates, float32 of shape [height, width, 3].
+    Raises:
+        ImportError: when rawpy, the extra ``raw``, is not installed.
+        ValueError: for a file of another format, or a damaged one.
+    """
+    check.importable("rawpy", path.suffix, "rawpy", "raw")
+    import rawpy
+
+    try:
+        with rawpy.imread(str(path)) as raw:
+            check_size(raw.sizes.width, raw.sizes.height)
+            codes = raw.postprocess(
+                gamma=(1, 1),
+                no_auto_bright=True,
+                adjust_maximum_thr=0,  # white is the sensor's, not the brightest pixel
+                use_camera_wb=True,
+                output_color=rawpy.ColorSpace.sRGB,
+                output_bps=16,
+            )
+    except rawpy.LibRawError as error:
+        raise ValueError(f"not a raw file that LibRaw reads, or a damaged one ({error})") from error
+    return (codes / 65535).astype(np.float32)
+
+
 _READERS: dict[str, Callable[..., np.ndarray]] = {
     ".exr": _read_exr,
     **dict.fromkeys([".hdr", ".pic"], read_radiance),
     **dict.fromkeys(INTEGER_SUFFIXES, _read_pillow),
-    **dict.fromkeys(RAW_SUFFIXES, read_raw),
+    **dict.fromkeys(_RAW_SUFFIXES, _read_raw),
 }
 """Readers by suffix, of a path and a function that raises for a width and height that are too large."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -108,10 +108,6 @@ class EnvironmentMap(metaclass=check.Hinting):
         shell = "" if self.radius is None else f", radius {self.radius:g} around {self.center.tolist()}"
         return f"EnvironmentMap({width} × {height}{shell})"
 
-    def _with_radiance(self, radiance: npt.ArrayLike) -> EnvironmentMap:
-        """Another map of the same shell."""
-        return EnvironmentMap(radiance, radius=self.radius, center=self.center)
-
     @classmethod
     def read(
         cls,
@@ -194,7 +190,7 @@ class EnvironmentMap(metaclass=check.Hinting):
         rows, columns, _ = self.radiance.shape
         weights = self.solid_angles().reshape(-1, step, 1, 1, 1)
         blocks = self.radiance.reshape(rows // step, step, columns // step, step, 3)
-        return self._with_radiance((weights * blocks).sum(axis=(1, 3)) / (step * weights.sum(axis=(1, 3))))
+        return replace(self, radiance=(weights * blocks).sum(axis=(1, 3)) / (step * weights.sum(axis=(1, 3))))
 
     def rotated(self, degrees: float) -> EnvironmentMap:
         """Turn the light about +y, around its center, counter-clockwise from above: +90 takes light from +z to +x.
@@ -212,11 +208,11 @@ class EnvironmentMap(metaclass=check.Hinting):
         rolled_radiance = np.roll(self.radiance, int(whole_columns), axis=1)
         if fraction:
             rolled_radiance = (1 - fraction) * rolled_radiance + fraction * np.roll(rolled_radiance, 1, axis=1)
-        return self._with_radiance(rolled_radiance)
+        return replace(self, radiance=rolled_radiance)
 
     def scaled(self, factor: npt.ArrayLike) -> EnvironmentMap:
         """Multiply the radiance by one factor, or by one for each of R, G, B."""
-        return self._with_radiance(self.radiance * _color("factor", factor))
+        return replace(self, radiance=self.radiance * _color("factor", factor))
 
     @check.keywords(**dict.fromkeys(("radius", "sun_radius", "size"), "angular_radius, in degrees"), color="irradiance")
     def with_sun(
@@ -253,7 +249,7 @@ class EnvironmentMap(metaclass=check.Hinting):
         cosines = sh.equirectangular_directions(height) @ (axis / np.linalg.norm(axis))
         disc = np.clip((radius + pixel / 2 - np.arccos(np.clip(cosines, -1, 1))) / pixel, 0, 1)
         disc /= np.sum(disc * np.maximum(cosines, 0) * sh.pixel_solid_angles(height)[:, None])
-        return self._with_radiance(pixels + disc[..., None] * _color("irradiance", irradiance))
+        return replace(self, radiance=pixels + disc[..., None] * _color("irradiance", irradiance))
 
     def _repr_png_(self) -> bytes:
         """The map as notebooks draw it: at most some 512 columns, at its automatic exposure."""

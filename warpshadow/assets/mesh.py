@@ -200,10 +200,8 @@ class Mesh:
         Returns:
             A new mesh with the same uvs and name.
         """
-        rotation = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
-        translation = np.zeros(3) if translation is None else np.asarray(translation, np.float64)
-        check.shape("rotation", rotation.shape, (3, 3))
-        check.shape("translation", translation.shape, (3,))
+        rotation = np.eye(3) if rotation is None else check.array("rotation", rotation, (3, 3))
+        translation = np.zeros(3) if translation is None else check.array("translation", translation, (3,))
         part = MeshPart(self.positions, self.faces, self.uvs, self.uv_faces)
         placed_part = moved_part(part, rotation * np.broadcast_to(scale, 3), translation)
         return replace(self, positions=placed_part.positions, faces=placed_part.faces, uv_faces=placed_part.uv_faces)

@@ -320,10 +320,8 @@ def _trimesh_picture(material, factors: gltf.Factors) -> BaseColor | None:
 
 def _read_usd(path: Path) -> list[MeshPart]:
     """Read the visible meshes of a USD stage in world space, y up."""
-    try:
-        from pxr import Usd, UsdGeom
-    except ImportError:
-        raise ImportError(check.missing("USD", "usd-core", "usd")) from None
+    check.importable("pxr", "USD", "usd-core", "usd")
+    from pxr import Usd, UsdGeom
 
     stage = Usd.Stage.Open(str(path))
     time = Usd.TimeCode.EarliestTime()

@@ -54,15 +54,14 @@ def join_parts(parts: list[MeshPart], name: str) -> JoinedMesh:
     if 0 < len(textured) < len(parts):
         remarks.append(f"uvs dropped because {len(parts) - len(textured)} of {len(parts)} parts have none")
     of_colors = sorted({part.colorless for part in parts if part.colorless})
+    reason = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
     pictures = [picture for part in parts for picture in part.pictures]
     is_one = mesh.uvs is not None and all(picture == pictures[0] for picture in pictures)
     if any(pictures) and not is_one:
-        reason = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
         of_colors.append(f"textures dropped, {reason}")
     glosses = [part.gloss or DIFFUSE for part in parts]
     of_gloss = []
     if any(gloss.image for gloss in glosses) and (mesh.uvs is None or any(gloss != glosses[0] for gloss in glosses)):
-        reason = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
         of_gloss.append(f"of textures of roughness and metallic the means count, {reason}")
     gloss = _joined_gloss(glosses, [len(part.positions) for part in parts], has_textures=not of_gloss)
     emissions = [part.emission for part in parts]
@@ -70,7 +69,6 @@ def join_parts(parts: list[MeshPart], name: str) -> JoinedMesh:
     has_own_uvs = any(emission and emission.image and emission.has_own_uvs for emission in emissions)
     is_shared = mesh.uvs is not None and not has_own_uvs and all(emission == emissions[0] for emission in emissions)
     if has_images and not is_shared:
-        reason = "which need uvs" if mesh.uvs is None else "since a body takes one that all its faces have"
         reason = "since a body takes those on the first uvs, of texCoord 0" if has_own_uvs else reason
         of_gloss.append(f"of textures of emission the means count, {reason}")
     picture, emission = pictures[0] if is_one else None, _joined_emission(parts, has_textures=is_shared)

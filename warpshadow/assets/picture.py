@@ -106,10 +106,14 @@ class Picture:
         path = check.path("path", path)
         if path.suffix.lower() not in SUFFIXES:
             raise ValueError(f"{path}: got extension {path.suffix!r}, expected one of {', '.join(SUFFIXES)}")
+        from PIL.PngImagePlugin import PngInfo
+
         with files.atomic_write(path) as temporary_path:
             comment = f"warpshadow: exposure {self.exposure:+.6f} stops, tone {self.tone}"
             if path.suffix.lower() == ".png":
-                _pillow(self.pixels).save(temporary_path, pnginfo=_comment_chunk(comment))
+                chunk = PngInfo()
+                chunk.add_text("Comment", comment)
+                _pillow(self.pixels).save(temporary_path, pnginfo=chunk)
             else:
                 opaque_pixels = self.opaque() if self.pixels.shape[2] == 4 else self.pixels
                 _pillow(opaque_pixels).save(temporary_path, quality=95, subsampling=0, comment=comment)
@@ -193,15 +197,6 @@ def _pillow(pixels: np.ndarray) -> Any:
     from PIL import Image
 
     return Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels)
-
-
-def _comment_chunk(comment: str) -> Any:
-    """A PNG file's comment."""
-    from PIL.PngImagePlugin import PngInfo
-
-    chunk = PngInfo()
-    chunk.add_text("Comment", comment)
-    return chunk
 
 
 def _codes(encoded_values: np.ndarray) -> np.ndarray:

@@ -19,55 +19,27 @@ _MAX_LATE = 64  # checks that wait, since they hold their arrays
 _SMALL = 10_000  # numbers up to which BLAS sums on one thread
 
 _Limits = wp.types.vector(length=_AT_ONCE, dtype=wp.float32)
-
-
-@wp.func
-def _is_outside(values: wp.array(dtype=wp.float32), item: int, minimum: float, maximum: float) -> bool:
-    result = bool(False)
-    if item < values.shape[0]:
-        result = not (values[item] >= minimum and values[item] <= maximum)  # so NaN, too
-    return result
+_Counts = wp.types.vector(length=_AT_ONCE, dtype=wp.int32)
+_Addresses = wp.types.vector(length=_AT_ONCE, dtype=wp.uint64)
 
 
 @wp.kernel(enable_backward=False)
 def _count_outside(
     # in
-    values_0: wp.array(dtype=wp.float32),
-    values_1: wp.array(dtype=wp.float32),
-    values_2: wp.array(dtype=wp.float32),
-    values_3: wp.array(dtype=wp.float32),
-    values_4: wp.array(dtype=wp.float32),
-    values_5: wp.array(dtype=wp.float32),
-    values_6: wp.array(dtype=wp.float32),
-    values_7: wp.array(dtype=wp.float32),
+    addresses: _Addresses,
+    counts: _Counts,
     minima: _Limits,
     maxima: _Limits,
     first: int,
     # out
     faults: wp.array(dtype=wp.int32),
 ):
-    """A thread owns a number of an array."""
+    """A thread owns a number of an array, which is given by its address and its count of numbers."""
     argument, item = wp.tid()
-    minimum, maximum = minima[argument], maxima[argument]
-    is_outside = bool(False)
-    if argument == 0:
-        is_outside = _is_outside(values_0, item, minimum, maximum)
-    elif argument == 1:
-        is_outside = _is_outside(values_1, item, minimum, maximum)
-    elif argument == 2:
-        is_outside = _is_outside(values_2, item, minimum, maximum)
-    elif argument == 3:
-        is_outside = _is_outside(values_3, item, minimum, maximum)
-    elif argument == 4:
-        is_outside = _is_outside(values_4, item, minimum, maximum)
-    elif argument == 5:
-        is_outside = _is_outside(values_5, item, minimum, maximum)
-    elif argument == 6:
-        is_outside = _is_outside(values_6, item, minimum, maximum)
-    else:
-        is_outside = _is_outside(values_7, item, minimum, maximum)
-    if is_outside:
-        wp.atomic_add(faults, first + argument, 1)
+    if item < counts[argument]:
+        values = wp.array(ptr=addresses[argument], shape=(counts[argument],), dtype=wp.float32)
+        if not (values[item] >= minima[argument] and values[item] <= maxima[argument]):  # so NaN, too
+            wp.atomic_add(faults, first + argument, 1)
 
 
 class _LateChecks(threading.local):
@@ -122,14 +94,20 @@ class _LateChecks(threading.local):
         faults = self.faults[device.alias]
         for first in range(0, len(arrays), _AT_ONCE):
             batch = arrays[first : first + _AT_ONCE]
-            values = [_scalars(array) for _, array, _ in batch]
-            ranges = [range_ for *_, range_ in batch] + [(0.0, 0.0)] * (_AT_ONCE - len(batch))
-            limits = [_Limits(*side) for side in zip(*ranges, strict=True)]
-            padding: list[None] = [None] * (_AT_ONCE - len(batch))
+            values = [array.contiguous() for _, array, _ in batch]
+            counts = [array.size * wp.types.type_size(array.dtype) for array in values]
+            padding = [0] * (_AT_ONCE - len(batch))
+            minima, maxima = zip(*(range_ for *_, range_ in batch), strict=True)
             wp.launch(
                 _count_outside,
-                dim=(len(batch), max(array.size for array in values)),
-                inputs=[*values, *padding, *limits, first],
+                dim=(len(batch), max(counts)),
+                inputs=[
+                    _Addresses(*(array.ptr for array in values), *padding),
+                    _Counts(*counts, *padding),
+                    _Limits(*minima, *padding),
+                    _Limits(*maxima, *padding),
+                    first,
+                ],
                 outputs=[faults],
                 device=device,
                 record_tape=False,
@@ -181,8 +159,9 @@ def finite_arrays(
     smallest = -maximum if minimum is None else minimum
     ranges = {name: (0.0 if name in nonnegative else smallest, maximum) for name in present}
     if not any(map(_is_awaited, devices)):
-        for name in _outside_on_host(present, ranges):
-            check.finite(name, present[name].numpy(), minimum=ranges[name][0], maximum=maximum)
+        for name, array in present.items():
+            if not _is_within(np.asarray(array), *ranges[name]):
+                check.finite(name, array.numpy(), minimum=ranges[name][0], maximum=maximum)
         return
     for name, array in present.items():
         key = array.ptr, array.shape, array.strides, ranges[name]
@@ -204,23 +183,9 @@ def look_at_values(array: wp.array, judge: Callable[[np.ndarray], None]) -> None
     _late_checks.run_if_due()
 
 
-def _outside_on_host(arrays: Mapping[str, wp.array], ranges: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Names of the arrays that hold a number out of their range, by NumPy."""
-    return [name for name, array in arrays.items() if not _is_within(np.asarray(array), *ranges[name])]
-
-
 def _is_within(values: np.ndarray, minimum: float, maximum: float) -> bool:
     """Whether no number is NaN or out of a range; of most small arrays the sum of squares tells, which is quicker."""
     is_small = values.size <= _SMALL and values.flags.c_contiguous
     if is_small and minimum == -maximum and float(np.vdot(values, values)) < (0.5 * maximum) ** 2:
         return True
     return bool(minimum <= np.minimum.reduce(values, None) and np.maximum.reduce(values, None) <= maximum)
-
-
-def _scalars(array: wp.array) -> wp.array:
-    """View an array of vectors or matrices as one of numbers."""
-    array = array.contiguous()
-    count = array.size * wp.types.type_size(array.dtype)
-    values = wp.array(ptr=array.ptr, dtype=wp.float32, shape=count, device=array.device)
-    values.viewed = array  # the memory stays while the view does
-    return values

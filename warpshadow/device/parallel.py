@@ -238,7 +238,12 @@ def _launch_slices(
         if gradients is None:
             arguments[argument_index] = first_part
         else:
-            arguments[argument_index] = _with_gradient(arguments[argument_index], first_part)
+            # kernels add to the gradient of the argument itself where they read a row of it as an array
+            value = arguments[argument_index]
+            assert value.is_contiguous
+            arguments[argument_index] = wp.array(
+                ptr=value.ptr, dtype=value.dtype, shape=value.shape, device=device, grad=first_part
+            )
             gradients[argument_index] = first_part
     launch = warp_internals.bound_kernel(kernel, arguments, device, gradients=gradients)
     starts = [dim[0] * k // slice_count for k in range(slice_count + 1)]
@@ -254,12 +259,6 @@ def _launch_slices(
             total += other
         sums = np.asarray(summed_arguments[argument_index])
         sums += total
-
-
-def _with_gradient(array: wp.array, gradient: wp.array) -> wp.array:
-    """View an array with another gradient, to which kernels add that read a row of the array as an array."""
-    assert array.is_contiguous
-    return wp.array(ptr=array.ptr, dtype=array.dtype, shape=array.shape, device=array.device, grad=gradient)
 
 
 def _share(run: Callable[[int, int], None], slice_count: int, workers: int) -> None:

@@ -100,7 +100,6 @@ class _CpuSignature(NamedTuple):
     """Calling convention of a CPU kernel."""
 
     arguments: list[_Argument]
-    gradients: list[_Argument]
     loaded_hooks: dict[str, Any]  # the loaded module with its entry points, as soon as one is
 
 
@@ -129,7 +128,7 @@ def _cpu_signature(kernel: wp.Kernel) -> _CpuSignature | None:
     starts = [getattr(layout, name).offset for name, _ in fields]
     sizes = [end - start for start, end in itertools.pairwise([*starts, ctypes.sizeof(layout)])]
     arguments = [_argument(kind, *of) for kind, *of in zip(kinds, (field for _, field in fields), sizes, strict=True)]
-    return _CpuSignature(arguments, [item._replace(pack=_or_zeros(item)) for item in arguments], {})
+    return _CpuSignature(arguments, {})
 
 
 def _argument(kind: Any, field: Any, size: int) -> _Argument:
@@ -144,24 +143,18 @@ def _argument(kind: Any, field: Any, size: int) -> _Argument:
     return _Argument(lambda value: bytes(value if type(value) is field else field(*value)) + padding, None, 0, zeros)
 
 
-def _or_zeros(argument: _Argument) -> Callable[[Any], Any] | None:
-    """The function that packs the gradient of an argument, which may have none."""
-    pack, zeros = argument.pack, argument.zeros
-    return None if pack is None else lambda value: zeros if value is None else pack(value)
-
-
-def _packed(arguments: Sequence[_Argument], values: Sequence[Any]) -> list[Any]:
-    """Parts of the struct of a kernel's arguments, one for each.
+def _packed(arguments: Sequence[_Argument], values: Sequence[Any], *, are_gradients: bool = False) -> list[Any]:
+    """Parts of the struct of a kernel's arguments, or of their gradients, one for each; any gradient may be None.
 
     Raises:
         TypeError: for an array that is not of the dtype and dimensions.
     """
     parts = []
     for (pack, dtype, ndim, zeros), value in zip(arguments, values, strict=True):
-        if pack is not None:
-            parts.append(pack(value))
-        elif value is None:
+        if value is None and (are_gradients or pack is None):
             parts.append(zeros)
+        elif pack is not None:
+            parts.append(pack(value))
         elif type(value) is wp.array and value.dtype is dtype and value.ndim == ndim:
             parts.append(value.ctype or value.__ctype__())
         else:
@@ -204,7 +197,7 @@ def bound_kernel(
     signature = _cpu_signature(kernel) if device.is_cpu else None
     is_plain = wp._src.context.runtime._apic_capture is None and not wp.config.print_launches
     if signature is not None and is_plain and (structs := _structs(signature, arguments, gradients)) is not None:
-        fields, _, loaded_hooks = signature
+        fields, loaded_hooks = signature
 
         # The parts of structs have addresses alone: the arrays are held for as long as the function.
         def run_plainly(
@@ -266,7 +259,7 @@ def _structs(
     try:
         structs = [_packed(signature.arguments, arguments)]
         if gradients is not None:
-            structs.append(_packed(signature.gradients, gradients))
+            structs.append(_packed(signature.arguments, gradients, are_gradients=True))
     except (TypeError, AttributeError, struct.error):
         return None
     return structs

@@ -234,11 +234,9 @@ def _solid(points: np.ndarray, triangles: np.ndarray, flatness: float = _FLATNES
         if _bulge(points[[*starts | ends]], points[begin], points[end]) > flatness * size:
             return None
         straight.append([begin, end, f, g])
-    return ConvexPart(
-        used_vertices,
-        np.searchsorted(used_vertices, triangles[largest_faces]),
-        _renumbered(np.array(straight), used_vertices),
-    )
+    straight_edges = np.array(straight)
+    straight_edges[:, :2] = np.searchsorted(used_vertices, straight_edges[:, :2])  # numbers among the corners
+    return ConvexPart(used_vertices, np.searchsorted(used_vertices, triangles[largest_faces]), straight_edges)
 
 
 def _prisms(points: np.ndarray, triangles: np.ndarray) -> list[ConvexPart] | None:
@@ -352,8 +350,3 @@ def _bulge(points: np.ndarray, begin: np.ndarray, end: np.ndarray) -> float:
     """Largest distance of points from a line."""
     direction = (end - begin) / np.linalg.norm(end - begin)
     return float(np.linalg.norm(np.cross(points - begin, direction), axis=1).max())
-
-
-def _renumbered(edges: np.ndarray, used_vertices: np.ndarray) -> np.ndarray:
-    """Edges whose corners are numbers among the used ones."""
-    return np.concatenate([np.searchsorted(used_vertices, edges[:, :2]), edges[:, 2:]], axis=1)

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.assets.basis import Basis, check_basis
+from warpshadow.assets.basis import Basis
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import KnownLightArgument
 from warpshadow.device.array_checks import finite_arrays
@@ -39,7 +39,7 @@ from warpshadow.pipeline.views.scene_views import SceneViews, camera_batch
 from warpshadow.pipeline.views.shading_ratio import shading_ratio
 from warpshadow.pipeline.views.view import View
 from warpshadow.pipeline.views.view_warnings import warn_of_vertex_receivers
-from warpshadow.scene.scene import BodyLike, PerBody, Scene, check_scene
+from warpshadow.scene.scene import BodyLike, PerBody, Scene
 from warpshadow.scene.visibility import METHODS
 
 RendererType = TypeVar("RendererType", bound="SceneRenderer")
@@ -96,8 +96,6 @@ class SceneRenderer:
         basis: Basis | None = None,
         progress: bool = False,
     ):
-        check_scene(scene)
-        check_basis(basis)
         where, scene = check.device("device", device), scene.with_method()
         check.choice("scene.visibility.method", scene.visibility.method, METHODS)
         options = {"device": str(where), "basis": basis, "progress": progress}

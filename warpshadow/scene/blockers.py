@@ -8,9 +8,9 @@ import warp as wp
 
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.progress import ANNOUNCED_SECONDS, announce
+from warpshadow.maths.adjacency import solid_angles
 from warpshadow.maths.convex import ConvexPart, is_panel
 from warpshadow.maths.plane import plane_normal
-from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.scene.body import Body, into_own_space
 from warpshadow.scene.height_fields import Land, solid_behind
 from warpshadow.scene.scene import Scene
@@ -138,33 +138,24 @@ def find_solids(scene: Scene, parts: Mapping[int, Sequence[ConvexPart]]) -> froz
 
 
 def fitted_counts(scene: Scene) -> dict[int, int | str]:
-    """Find the bodies to which spheres are fitted: neither grounds, nor bodies with spheres of their own.
-
-    Returns:
-        Numbers of the bodies, from 0, and how many spheres each takes, or "auto".
-    """
-    return _fitted_counts(scene, _convex_parts(scene))
-
-
-def _fitted_counts(scene: Scene, parts: dict[int, list[ConvexPart]]) -> dict[int, int | str]:
-    """Find the bodies to which spheres are fitted, given the convex parts of the scene."""
-    grounds = _ground_spheres(scene)
-    counts = [
-        SPHERES_BESIDE_PARTS if number in parts else _requested_count(body) for number, body in enumerate(scene.bodies)
-    ]
-    return {number: count for number, count in enumerate(counts) if count and grounds[number] is None}
+    """How many spheres are fitted to bodies, or "auto", by their numbers: see :func:`fitted_meshes`."""
+    return {number: fit.sphere_count for number, fit in fitted_meshes(scene).items()}
 
 
 def fitted_meshes(scene: Scene) -> dict[int, FitRequest]:
-    """Find the meshes to which spheres are fitted, and how many, by the number of the body: see :func:`fitted_counts`.
+    """Find the meshes to which spheres are fitted, and how many, by the number of the body.
 
-    A mesh is the body's own, or the solid behind it where it is land and no convex parts.
+    Neither grounds nor bodies with spheres of their own have any. A mesh is the body's own, or the solid behind it
+    where it is land and no convex parts.
     """
     parts, result = _convex_parts(scene), {}
-    for number, count in _fitted_counts(scene, parts).items():
+    for number, (body, ground) in enumerate(zip(scene.bodies, _ground_spheres(scene), strict=True)):
+        count = SPHERES_BESIDE_PARTS if number in parts else _requested_count(body)
+        if not count or ground is not None:
+            continue
         land = None if number in parts else _solid_behind(scene, number)
         steps = STEPS_BESIDE_PARTS if number in parts else STEPS
-        mesh, seen_from = (scene.bodies[number].mesh, None) if land is None else (land.solid, land.seen_from)
+        mesh, seen_from = (body.mesh, None) if land is None else (land.solid, land.seen_from)
         result[number] = FitRequest(mesh, count, steps, seen_from)
     return result
 

@@ -25,9 +25,7 @@ from warpshadow.spheres import Spheres
 
 RECEIVERS = (AUTO, "vertex", "pixel", "adaptive")
 
-COLORS_SUFFIX = ".npy"  # suffixes of files with a color for each vertex; other text is no albedo
-
-VALUES_SUFFIX = ".npy"  # suffix of files with a number for each vertex
+ARRAY_SUFFIX = ".npy"  # suffix of files with a color or a number for each vertex; other text is no albedo
 
 _SPHERES_SUFFIX = ".npz"
 
@@ -216,10 +214,10 @@ class Body:
         """Replace paths by the content of their files."""
         readers: tuple[tuple[str, Callable[[Path], Any], str, type[ValueError]], ...] = (
             ("texture", read_rgb, "", ImageError),
-            ("albedo", _read_colors, COLORS_SUFFIX, ValueError),
-            ("emission", _read_colors, COLORS_SUFFIX, ValueError),
+            ("albedo", _read_colors, ARRAY_SUFFIX, ValueError),
+            ("emission", _read_colors, ARRAY_SUFFIX, ValueError),
             ("blockers", Spheres.read, _SPHERES_SUFFIX, ValueError),
-            *((name, partial(_read_colors, shape="[vertex]"), VALUES_SUFFIX, ValueError) for name in GLOSS_ARGUMENTS),
+            *((name, partial(_read_colors, shape="[vertex]"), ARRAY_SUFFIX, ValueError) for name in GLOSS_ARGUMENTS),
         )
         for name, read, suffix, error in readers:
             value = getattr(self, name)

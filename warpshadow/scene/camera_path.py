@@ -20,7 +20,7 @@ stays.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -157,7 +157,7 @@ class CameraPath:
                 seen = Camera.look_at(eye, target, up=up, fov_y=float(values[9]), size=(like.width, like.height))
             intrinsics = like.intrinsics.copy()
             intrinsics[:2, :2] *= seen.intrinsics[1, 1] / intrinsics[1, 1]
-            cameras.append(Camera(intrinsics, seen.rotation, seen.translation, like.width, like.height, like.near))
+            cameras.append(replace(like, intrinsics=intrinsics, rotation=seen.rotation, translation=seen.translation))
         return cameras
 
     def _interpolate(self, rows: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from warpshadow.assets.sky import synthetic_sky
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
 from warpshadow.scene import toml_tables
-from warpshadow.scene.body import COLORS_SUFFIX, VALUES_SUFFIX, Body
+from warpshadow.scene.body import ARRAY_SUFFIX, Body
 from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import Bounces, Scene, check_bounces, check_scene, check_supersampling
 from warpshadow.scene.toml_tables import Table
@@ -178,27 +178,21 @@ def _light(table: Table, folder: Path) -> KnownLightArgument:
         raise ValueError(f'{next(iter(shell))}: got it without envmap, expected envmap = "FILE" beside it')
     if "sh" in table and "sun" in table:
         raise ValueError("sun: got it beside sh, expected envmap or sky beside it, which hold one")
+    if "sh" in table:
+        coefficients = check.numbers("sh", table["sh"], expected="rows of 3 finite numbers", dtype=np.float64)
+        check.shape("sh", coefficients.shape, ("order²", 3), "rows of 3 finite numbers")
+        check.finite("sh", coefficients)
+        sh.order_of("sh", coefficients)
+        return turned_light(coefficients, rotation, scale)
     if "envmap" in table:
         envmap = EnvironmentMap.read(toml_tables.file(table, "envmap", folder), **shell)
-        return turned_light(_with_sun(envmap, table), rotation, scale)
-    if "sky" in table:
+    else:
         with check.located("sky"):
-            sky = toml_tables.make(synthetic_sky, table["sky"])
-        return turned_light(_with_sun(sky, table), rotation, scale)
-    coefficients = check.numbers("sh", table["sh"], expected="rows of 3 finite numbers", dtype=np.float64)
-    check.shape("sh", coefficients.shape, ("order²", 3), "rows of 3 finite numbers")
-    check.finite("sh", coefficients)
-    sh.order_of("sh", coefficients)
-    return turned_light(coefficients, rotation, scale)
-
-
-def _with_sun(envmap: EnvironmentMap, table: Table) -> EnvironmentMap:
-    """A map with the sun that a table may have."""
-    if "sun" not in table:
-        return envmap
-    with check.located("sun"):
-        toml_tables.check_table(table["sun"])
-        return toml_tables.make(envmap.with_sun, table["sun"])
+            envmap = toml_tables.make(synthetic_sky, table["sky"])
+    if "sun" in table:
+        with check.located("sun"):
+            envmap = toml_tables.make(envmap.with_sun, table["sun"])
+    return turned_light(envmap, rotation, scale)
 
 
 def turned_light(light: KnownLightArgument, rotation: float, scale: float) -> KnownLightArgument:
@@ -227,11 +221,8 @@ def _body(table: Table, folder: Path) -> Body:
     place: Table = {"mesh": mesh} | {key: table[key] for key in _PLACE_KEYS if key in table}
     if "texture" in place:
         place["texture"] = toml_tables.file(table, "texture", folder)
-    for name in ("albedo", "emission"):
-        if isinstance(place.get(name), str) and place[name].endswith(COLORS_SUFFIX):
-            place[name] = toml_tables.file(table, name, folder)
-    for name in GLOSS_ARGUMENTS:
-        if isinstance(place.get(name), str) and place[name].endswith(VALUES_SUFFIX):
+    for name in ("albedo", "emission", *GLOSS_ARGUMENTS):
+        if isinstance(place.get(name), str) and place[name].endswith(ARRAY_SUFFIX):
             place[name] = toml_tables.file(table, name, folder)
     if "spheres" in place:
         path = toml_tables.file(place, "spheres", folder)
@@ -345,7 +336,7 @@ def camera_table(camera: Camera) -> Table:
 
 def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
     """Write the files that a body's table names, and make the table."""
-    mesh, arrays, colors, texture = (stem.with_suffix(suffix) for suffix in (".obj", ".npz", ".npy", ".exr"))
+    mesh, arrays, colors, texture = (stem.with_suffix(suffix) for suffix in (".obj", ".npz", ARRAY_SUFFIX, ".exr"))
     body.mesh.write(mesh)
     table: Table = {"mesh": mesh.name}
     written = [mesh]
@@ -367,20 +358,17 @@ def _write_body(body: Body, stem: Path) -> tuple[Table, list[Path]]:
         table["spheres"] = arrays.name
         written.append(arrays)
     place: Table = {"rotation": list(body.rotation), "translation": list(body.translation), "scale": float(body.scale)}
-    for name in GLOSS_ARGUMENTS:
+    for name in (*GLOSS_ARGUMENTS, "emission"):
         values = getattr(body, name)
         if values is None:
             continue
         if values.shape == (1,):
             place[name] = _numbers(values)[0]
+        elif name == "emission" and values.ndim == 1:
+            place[name] = _numbers(values)
         else:
-            written.append(_write_array(stem.with_name(f"{stem.name}_{name}{VALUES_SUFFIX}"), values))
+            written.append(_write_array(stem.with_name(f"{stem.name}_{name}{ARRAY_SUFFIX}"), values))
             place[name] = written[-1].name
-    if body.emission is not None and body.emission.ndim == 1:
-        place["emission"] = _numbers(body.emission)
-    elif body.emission is not None:
-        written.append(_write_array(stem.with_name(f"{stem.name}_emission{COLORS_SUFFIX}"), body.emission))
-        place["emission"] = written[-1].name
     if body.beam is not None:
         place["beam"] = list(body.beam)
     if body.self_shadows is not None:

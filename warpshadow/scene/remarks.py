@@ -10,8 +10,8 @@ import numpy as np
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.topology import CREASE
+from warpshadow.maths.adjacency import solid_angles
 from warpshadow.maths.plane import plane_normal
-from warpshadow.maths.solid_angle import solid_angles
 from warpshadow.maths.suns import separate_suns
 from warpshadow.scene.body import Body
 from warpshadow.scene.scene import Scene

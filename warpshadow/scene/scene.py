@@ -19,8 +19,8 @@ from warpshadow.assets.light import KNOWN_LIGHTS, LIGHT, EnvironmentMap, KnownLi
 from warpshadow.assets.mesh import Mesh
 from warpshadow.check import AnyPath
 from warpshadow.maths import sh
+from warpshadow.maths.plane import is_flat, principal_axes
 from warpshadow.scene.body import Body
-from warpshadow.scene.spots import has_narrow_spot
 from warpshadow.scene.visibility import (
     BOUNCE_METHODS,
     DEFAULT_METHOD,
@@ -56,6 +56,9 @@ FUNCTIONS_OF_SCENES = {
 """Functions that are looked for among a scene's methods."""
 
 _DEFAULT_VISIBILITY = Visibility()
+
+_NARROW_SPOT = 0.16
+"""Radius of a narrow spot, at most, in units of the flat body's size, or the scene's if that is smaller."""
 
 _SEVERAL_CAMERAS = "several go to Renderer(scene, cameras=[…]), or in a torch loop to TorchRenderer(scene, cameras=[…])"
 
@@ -119,6 +122,30 @@ def check_bodies_within(bodies: Iterable[Body], shell: np.ndarray) -> None:
                 f"light: got a map of radius {shell[3]:g} around {shell[:3].tolist()}, outside of which body "
                 f"{body.name!r} reaches, {distance:.4g} from there; expected a larger radius, or smaller bodies"
             )
+
+
+def _has_narrow_spot(bodies: Sequence[Body]) -> bool:
+    """Whether a lamp is so near a flat body that light bounces off a narrow spot of it.
+
+    The radius of a spot is the lamp's distance, or half of the lamp's size.
+    """
+    is_lamp = np.array([body.is_emitter for body in bodies])
+    if not is_lamp.any():
+        return False
+    points = [body.world_points().astype(np.float64) for body in bodies]
+    low, high = (np.stack([end(item, axis=0) for item in points]) for end in (np.min, np.max))
+    middles, radii = (low + high) / 2, (high - low).max(axis=1) / 2
+    for number, body in enumerate(bodies):
+        if is_flat(points[number]):
+            others = np.arange(len(points)) != number
+            extent = (high[others].max(axis=0) - low[others].min(axis=0)).max() if others.any() else 0.0
+            size = min(body.scale * np.sqrt(body.mesh.area), extent)
+            heights = np.abs((middles - middles[number]) @ principal_axes(points[number])[2])
+            distances = np.linalg.norm(middles - np.clip(middles, low[number], high[number]), axis=1)
+            spots = np.maximum.reduce([heights, distances, radii])
+            if (spots < _NARROW_SPOT * size)[is_lamp & others].any():
+                return True
+    return False
 
 
 class Bodies(tuple[Body, ...]):
@@ -286,7 +313,7 @@ class Scene:
         """
         if self.visibility.directions is not None:
             return self.visibility.directions
-        if self.bounces and has_narrow_spot(self.bodies):
+        if self.bounces and _has_narrow_spot(self.bodies):
             return DIRECTIONS_OF_SPOTS
         roughness = [body.roughness.min() for body in self.bodies if body.roughness is not None]
         return DIRECTIONS_OF_GLOSS if min(roughness, default=1.0) < NARROW_ROUGHNESS else DIRECTIONS

@@ -79,10 +79,10 @@ NARROW_ROUGHNESS = 0.3
 """… this roughness. A metal ball of roughness 0.2 on a ground is 9.2, 6.0 and 3.9% off with 128, 256 and 512 cells."""
 
 DIRECTIONS_OF_SPOTS = 512
-"""Cells where light bounces and a lamp is near a flat body (:func:`.spots.has_narrow_spot`). Its spot there, narrower
-than a cell, draws bands on walls: a room where a ball of light stands on the floor is 15.2, 8.4 and 4.7% off with 128,
-256 and 512 cells, where it is below the ceiling, by 0.05 of the room's height, 8.8, 6.4 and 4.2%, by 0.15, 3.0, 1.8 and
-1.3%. An image of moved bodies takes 2.2 times as long as with 128."""
+"""Cells where light bounces and a lamp is near a flat body. Its spot there, narrower than a cell, draws bands on
+walls: a room where a ball of light stands on the floor is 15.2, 8.4 and 4.7% off with 128, 256 and 512 cells, where it
+is below the ceiling, by 0.05 of the room's height, 8.8, 6.4 and 4.2%, by 0.15, 3.0, 1.8 and 1.3%. An image of moved
+bodies takes 2.2 times as long as with 128."""
 
 _INDEPENDENT_RAYS = 1024  # rays unless ``samples`` says how many, where each receiver has its own
 

@@ -115,8 +115,8 @@ def fit_spheres(
     key = count, error, seed, steps, seen_from, fit_device.alias, cache_folder()
     if cache and key in _FITS.get(mesh, ()):
         return _FITS[mesh][key]
-    fit_key, center, diagonal = _find_fit_key(mesh, seed, steps, fit_device, seen_from)
-    fit_count = partial(_cached_fit if cache else _fit, fit_key, progress)
+    fits, center, diagonal = _fits_of(mesh, seed, steps, fit_device, seen_from, progress)
+    fit_count = fits.cached_fit if cache else fits.fit
     with unrecorded():
         balls, report = fit_count(count) if error is None else _search(fit_count, error)
     if error is None and warns:
@@ -175,8 +175,8 @@ def is_fitted(
     device: wp.DeviceLike = "cpu",
 ) -> bool:
     """Whether the cache has the fit of :func:`fit_spheres` for a mesh, a count, a number of steps and a direction."""
-    fit_key, *_ = _find_fit_key(mesh, 0, steps, wp.get_device(device), _unit_vector(seen_from))
-    return _cache_path(fit_key, count).exists()
+    fits, *_ = _fits_of(mesh, 0, steps, wp.get_device(device), _unit_vector(seen_from))
+    return fits.cache_path(count).exists()
 
 
 def fit_seconds(count: int | str) -> float:
@@ -184,17 +184,22 @@ def fit_seconds(count: int | str) -> float:
     return 8.4 if isinstance(count, str) else 1.3 + 0.013 * count
 
 
-def _find_fit_key(
-    mesh: Mesh, seed: int, steps: int, device: wp.Device, seen_from: tuple[float, float, float] | None
-) -> tuple[_SphereFitKey, np.ndarray, float]:
-    """Key of a fit; the middle of the mesh's bounds and their diagonal."""
+def _fits_of(
+    mesh: Mesh,
+    seed: int,
+    steps: int,
+    device: wp.Device,
+    seen_from: tuple[float, float, float] | None,
+    progress: bool = False,
+) -> tuple[_MeshFits, np.ndarray, float]:
+    """Fits to a mesh in the frame of the fit; the middle of the mesh's bounds and their diagonal."""
     positions, faces = welded(mesh.positions, mesh.faces)  # parted at creases or not, a mesh has the same spheres
     positions = positions.astype(np.float64)
     corners = positions[faces]
     if not area_normals(corners).any():
         raise ValueError("mesh: got only faces without area, expected a surface")
     normalized, center, diagonal = normalize(positions)
-    return _SphereFitKey(normalized, faces, seed, steps, device, seen_from), center, diagonal
+    return _MeshFits(normalized, faces, seed, steps, device, seen_from, progress), center, diagonal
 
 
 def _search(
@@ -221,8 +226,8 @@ def _search(
 
 
 @dataclass(frozen=True)
-class _SphereFitKey:
-    """Key of a fit, without the number of spheres."""
+class _MeshFits:
+    """Fits of spheres [sphere, 4] to a normalized mesh, by their number."""
 
     positions: np.ndarray
     faces: np.ndarray
@@ -230,9 +235,10 @@ class _SphereFitKey:
     steps: int
     device: wp.Device
     seen_from: tuple[float, float, float] | None  # from which alone the mesh is seen
+    progress: bool
 
-    def key(self, count: int | str) -> str:
-        """Hash of all of it."""
+    def cache_path(self, count: int | str) -> Path:
+        """File of a fit in the cache, named by a hash of all that it depends on."""
         kind = "cpu" if self.device.is_cpu else "cuda"
         key_numbers = [ALGORITHM_VERSION, count, self.seed, self.steps, kind, self.positions.shape]
         if self.seen_from is not None:
@@ -240,89 +246,79 @@ class _SphereFitKey:
         key = hashlib.sha256(json.dumps(key_numbers).encode())
         key.update(self.positions.tobytes())
         key.update(self.faces.tobytes())
-        return key.hexdigest()
+        return cache_path("spheres", key.hexdigest())
 
+    def cached_fit(self, count: int | str) -> tuple[np.ndarray, FitReport]:
+        """Read a fit from the cache, or make it and write it there."""
 
-def _fit(
-    fit_key: _SphereFitKey, progress: bool, count: int | str, unfinished: Unfinished | None = None
-) -> tuple[np.ndarray, FitReport]:
-    """Fit spheres [sphere, 4] to a normalized mesh, from where an interrupt left them."""
-    from threadpoolctl import threadpool_limits
+        def read(cached_arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, FitReport]:
+            spheres, report = cached_arrays["spheres"], FitReport(**json.loads(str(cached_arrays["report"])))
+            check.shape("spheres", spheres.shape, (report.sphere_count, 4))
+            return spheres, replace(report, cached=True)
 
-    cached_arrays = {} if unfinished is None else unfinished.before
-    began = time.perf_counter() - float(cached_arrays.get("seconds", 0.0))
-    seen_from = None if fit_key.seen_from is None else np.array(fit_key.seen_from)
-    mesh = NormalizedMesh(fit_key.positions, fit_key.faces, fit_key.device, seen_from)
-    spheres = cached_arrays.get("spheres", np.zeros((0, 4)))
-    total, done_steps = fit_key.steps if count else 0, int(cached_arrays.get("step_count", 0))
-    label = f"fitting {'as many spheres as it takes' if count == AUTO else f'{count} spheres'}"
+        def arrays(fit: tuple[np.ndarray, FitReport]) -> dict[str, np.ndarray]:
+            return {"spheres": fit[0], "report": np.array(json.dumps(asdict(fit[1])))}
 
-    def store_part(part: str, **arrays: np.ndarray) -> None:
-        if unfinished is None:
-            return
-        seconds = np.array(time.perf_counter() - began)
-        unfinished.keep(lambda: {"seconds": seconds, **arrays}, part)
+        path = self.cache_path(count)
+        if path in _UNWRITTEN and not path.exists():
+            return _UNWRITTEN[path]
+        fit = load_or_compute(path, read, partial(self.fit, count), arrays, noun="fit")
+        if not path.exists():
+            _UNWRITTEN[path] = fit[0], replace(fit[1], cached=True)
+        return fit
 
-    # threads for products of such small matrices wait for each other, for seconds where cores are busy
-    with progress_bar(total, label, "step", done=done_steps, shows=progress) as bar, threadpool_limits(limits=1):
-        if count:
-            for descent_state in _descend(mesh, fit_key, count, cached_arrays, store_part):
-                spheres = descent_state
-                bar.update()
-        spheres = spheres[spheres[:, 3] > 1e-4].astype(np.float32)
-        return spheres, measure(mesh, spheres.astype(np.float64), time.perf_counter() - began)
+    def fit(self, count: int | str, unfinished: Unfinished | None = None) -> tuple[np.ndarray, FitReport]:
+        """Make a fit, from where an interrupt left it."""
+        from threadpoolctl import threadpool_limits
 
+        cached_arrays = {} if unfinished is None else unfinished.before
+        began = time.perf_counter() - float(cached_arrays.get("seconds", 0.0))
+        seen_from = None if self.seen_from is None else np.array(self.seen_from)
+        mesh = NormalizedMesh(self.positions, self.faces, self.device, seen_from)
+        spheres = cached_arrays.get("spheres", np.zeros((0, 4)))
+        total, done_steps = self.steps if count else 0, int(cached_arrays.get("step_count", 0))
+        label = f"fitting {'as many spheres as it takes' if count == AUTO else f'{count} spheres'}"
 
-def _descend(
-    mesh: NormalizedMesh,
-    fit_key: _SphereFitKey,
-    count: int | str,
-    cached_arrays: Mapping[str, np.ndarray],
-    store_part: Callable[..., None],
-) -> Iterator[np.ndarray]:
-    """Fit one sphere or more; yields them after every step.
+        def store_part(part: str, **arrays: np.ndarray) -> None:
+            if unfinished is not None:
+                seconds = np.array(time.perf_counter() - began)
+                unfinished.keep(lambda: {"seconds": seconds, **arrays}, part)
 
-    Args:
-        cached_arrays: Arrays that an interrupted call left.
-        store_part: Gets how far it is in words, and arrays from which a later call goes on.
-    """
-    rng = np.random.default_rng(fit_key.seed)
-    receivers = FitReceivers(mesh, RECEIVERS, rng)
-    start: np.ndarray | DescentState
-    if "spheres" in cached_arrays:
-        start = DescentState(**{name: cached_arrays[name] for name in DescentState._fields})
-    else:
-        if isinstance(count, str):
+        # threads for products of such small matrices wait for each other, for seconds where cores are busy
+        with progress_bar(total, label, "step", done=done_steps, shows=self.progress) as bar, threadpool_limits(1):
+            if count:
+                for descent_state in self._descend(mesh, count, cached_arrays, store_part):
+                    spheres = descent_state.spheres
+                    bar.update()
+            spheres = spheres[spheres[:, 3] > 1e-4].astype(np.float32)
+            return spheres, measure(mesh, spheres.astype(np.float64), time.perf_counter() - began)
 
-            def store_errors(errors: list[Sequence[float]]) -> None:
-                store_part(f"{len(errors)} short fits", errors=np.array(errors))
+    def _descend(
+        self,
+        mesh: NormalizedMesh,
+        count: int | str,
+        cached_arrays: Mapping[str, np.ndarray],
+        store_part: Callable[..., None],
+    ) -> Iterator[DescentState]:
+        """Fit one sphere or more; yields where it is after every step.
 
-            count = enough_spheres(mesh, receivers, fit_key.seed, [*cached_arrays.get("errors", ())], store_errors)
-        start = greedy_cover(mesh, count, rng)
-    for descent_state in Refinement(mesh, receivers, rng).run(start, fit_key.steps):
-        store_part(f"{descent_state.step_count} of {fit_key.steps} steps", **descent_state._asdict())
-        yield descent_state.spheres
+        Args:
+            cached_arrays: Arrays that an interrupted call left.
+            store_part: Gets how far it is in words, and arrays from which a later call goes on.
+        """
+        rng = np.random.default_rng(self.seed)
+        receivers = FitReceivers(mesh, RECEIVERS, rng)
+        start: np.ndarray | DescentState
+        if "spheres" in cached_arrays:
+            start = DescentState(**{name: cached_arrays[name] for name in DescentState._fields})
+        else:
+            if isinstance(count, str):
 
+                def store_errors(errors: list[Sequence[float]]) -> None:
+                    store_part(f"{len(errors)} short fits", errors=np.array(errors))
 
-def _cache_path(fit_key: _SphereFitKey, count: int | str) -> Path:
-    return cache_path("spheres", fit_key.key(count))
-
-
-def _cached_fit(fit_key: _SphereFitKey, progress: bool, count: int | str) -> tuple[np.ndarray, FitReport]:
-    """Read a fit from the cache, or make it and write it there."""
-
-    def read(cached_arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, FitReport]:
-        spheres, report = cached_arrays["spheres"], FitReport(**json.loads(str(cached_arrays["report"])))
-        check.shape("spheres", spheres.shape, (report.sphere_count, 4))
-        return spheres, replace(report, cached=True)
-
-    def arrays(fit: tuple[np.ndarray, FitReport]) -> dict[str, np.ndarray]:
-        return {"spheres": fit[0], "report": np.array(json.dumps(asdict(fit[1])))}
-
-    path = _cache_path(fit_key, count)
-    if path in _UNWRITTEN and not path.exists():
-        return _UNWRITTEN[path]
-    fit = load_or_compute(path, read, partial(_fit, fit_key, progress, count), arrays, noun="fit")
-    if not path.exists():
-        _UNWRITTEN[path] = fit[0], replace(fit[1], cached=True)
-    return fit
+                count = enough_spheres(mesh, receivers, self.seed, [*cached_arrays.get("errors", ())], store_errors)
+            start = greedy_cover(mesh, count, rng)
+        for descent_state in Refinement(mesh, receivers, rng).run(start, self.steps):
+            store_part(f"{descent_state.step_count} of {self.steps} steps", **descent_state._asdict())
+            yield descent_state

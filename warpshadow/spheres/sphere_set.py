@@ -83,12 +83,8 @@ class Spheres:
         Raises:
             ValueError: when the matrix is no rotation, or a number is not finite or the scale not positive.
         """
-        rotation = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
-        translation = np.asarray(translation, np.float64)
-        check.shape("rotation", rotation.shape, (3, 3))
-        check.shape("translation", translation.shape, (3,))
-        check.finite("rotation", rotation)
-        check.finite("translation", translation)
+        rotation = np.eye(3) if rotation is None else check.array("rotation", rotation, (3, 3))
+        translation = check.array("translation", translation, (3,))
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
             raise ValueError(f"rotation: got {rotation.tolist()}, expected an orthogonal matrix")
         if not (np.isfinite(scale) and scale > 0):

@@ -5,9 +5,8 @@ mesh included. With direct light on diffuse bodies an iteration is then a matrix
 """
 
 from warpshadow.torch.autograd import apply
-from warpshadow.torch.cameras import clip_matrices_from_opengl
+from warpshadow.torch.conversions import clip_matrices_from_opengl, rotation_matrices
 from warpshadow.torch.mixed import MixedRenderer
 from warpshadow.torch.renderer import LayerTensors, TorchRenderer
-from warpshadow.torch.rotations import rotation_matrices
 
 __all__ = ["LayerTensors", "MixedRenderer", "TorchRenderer", "apply", "clip_matrices_from_opengl", "rotation_matrices"]

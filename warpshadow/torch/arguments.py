@@ -17,7 +17,7 @@ from warpshadow.device.constants import IdentityKey
 from warpshadow.device.warp_internals import item_shape
 from warpshadow.pipeline.bodies.geometry import GEOMETRY_DTYPES, PLACED, Geometry, as_geometry
 from warpshadow.pipeline.image_inputs import ImageInputs
-from warpshadow.torch.autograd import apply, as_array, check_float32, is_capturing
+from warpshadow.torch.autograd import TensorFunction, as_array, check_float32, is_capturing
 from warpshadow.torch.replay import Replays
 
 # tensors about which a renderer caches results while they stay the same
@@ -105,10 +105,10 @@ class Arguments:
         Results lose a batch dimension that no tensor had.
         """
         self._common_batch()
-        find_capture = None
+        find_replay = None
         if replays is not None:
             reused = [number for number, name in enumerate(self.names) if name.startswith(_CACHED_BY_VALUE)]
-            find_capture = functools.partial(replays.find, lambda: tuple(map(_key, inputs)), reused)
+            find_replay = functools.partial(replays.find, functools.partial(_key, [*inputs]), reused)
         geometries: list[Geometry[wp.array]] = []
 
         def call(*arrays: wp.array) -> Any:
@@ -118,18 +118,12 @@ class Arguments:
             geometries.append(result)
             return result.all_arrays()
 
-        results = apply(
-            call,
-            *self.tensors,
-            dtypes=self.dtypes,
-            device=self.device,
-            names=self.names,
-            affine=affine,
-            find_capture=find_capture,
-        )
+        results = TensorFunction(call, self.dtypes, self.device, self.names, affine, find_replay)(*self.tensors)
         if not self._has_batch:
-            results = tuple(result[0] for result in results) if isinstance(results, tuple) else results[0]
-        return geometries[0].with_arrays(results) if geometries else results
+            results = tuple(result[0] for result in results)
+        if geometries:
+            return geometries[0].with_arrays(results)
+        return results if len(results) > 1 else results[0]
 
     def _common_batch(self) -> int:
         return common_batch({"cameras": self._cameras, **dict(zip(self.names, self.tensors, strict=True))})

@@ -7,7 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, ParamSpec, Protocol, TypeAlias, TypeVar, overload
+from typing import NamedTuple, ParamSpec, TypeAlias, TypeVar, overload
 
 import numpy as np
 import torch
@@ -26,28 +26,12 @@ Playback: TypeAlias = Callable[[Sequence[torch.Tensor]], tuple[torch.Tensor | No
 """The gradient to each argument of a call, given the results' gradients; None where it requires none."""
 
 
-class Replayable(Protocol):
-    """A call that has been captured."""
+class CallResults(NamedTuple):
+    """Results of a function of arrays as tensors, and the way back."""
 
-    @property
-    def results_require_grad(self) -> list[bool]:
-        """Whether each result depends on tensors that require a gradient."""
-
-    def replay(self, tensors: Sequence[torch.Tensor]) -> tuple[tuple[torch.Tensor, ...], Playback]:
-        """The results, and the call for its gradients."""
-
-
-class TensorCall(NamedTuple):
-    """A call of a function of arrays with tensors."""
-
-    function: Callable[..., Any]
-    tensors: Sequence[torch.Tensor]
-    dtypes: Sequence[type]
-    requires_grad: Sequence[bool]  # whether a gradient to each tensor is asked for
-    device: torch.device
-
-
-FindCapture: TypeAlias = Callable[[TensorCall], Replayable | None]
+    tensors: tuple[torch.Tensor, ...]
+    require_grad: list[bool]  # whether each depends on arguments that require a gradient
+    playback: Playback | None  # None if none does
 
 
 def outside_torch_compile(function: Callable[P, R]) -> Callable[P, R]:
@@ -75,7 +59,6 @@ def apply(
     device: torch.device | None = None,
     names: Sequence[str] | None = None,
     affine: Collection[str] = (),
-    find_capture: FindCapture | None = None,
 ) -> tuple[torch.Tensor, ...]: ...
 
 
@@ -87,7 +70,6 @@ def apply(
     device: torch.device | None = None,
     names: Sequence[str] | None = None,
     affine: Collection[str] = (),
-    find_capture: FindCapture | None = None,
 ) -> torch.Tensor: ...
 
 
@@ -99,7 +81,6 @@ def apply(
     device: torch.device | None = None,
     names: Sequence[str] | None = None,
     affine: Collection[str] = (),
-    find_capture: FindCapture | None = None,
 ) -> torch.Tensor | tuple[torch.Tensor, ...]:
     """Apply a differentiable function of Warp arrays to tensors.
 
@@ -113,7 +94,6 @@ def apply(
         names: Names of the tensors in messages, by default ``tensors[0]`` and so on.
         affine: Names of the tensors in which the function is affine while all others are fixed: only gradients to
             these can be differentiated again.
-        find_capture: Finds the graphs that compute the call instead, if there are any (:mod:`.replay`).
     Returns:
         The array as a tensor, or a tuple of tensors for a tuple of arrays.
     Raises:
@@ -123,12 +103,7 @@ def apply(
     names = names or [f"tensors[{number}]" for number in range(len(tensors))]
     for name, tensor in zip(names, tensors, strict=True):
         check_float32(name, tensor)
-    wp.init()
-    if torch.get_num_threads() > 1:
-        _let_waiting_threads_sleep()
-    requires_grad = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in tensors)
-    call = _Call(function, tuple(dtypes), device or tensors[0].device, tuple(names), frozenset(affine), find_capture)
-    results = _WarpFunction.apply(call, requires_grad, *tensors)
+    results = TensorFunction(function, dtypes, device or tensors[0].device, names, affine)(*tensors)
     return results if len(results) > 1 else results[0]
 
 
@@ -185,15 +160,53 @@ def tensor_of(array: wp.array) -> torch.Tensor:
 
 
 @dataclass(frozen=True)
-class _Call:
-    """A function that is applied to tensors, and the arguments of :func:`apply`."""
+class TensorFunction:
+    """A function of arrays that is applied to tensors, as :func:`apply` says.
+
+    Args:
+        find_replay: Finds graphs that compute a call in its place, for tensors and whether a gradient to each is asked
+            for; None if there are none (:mod:`.replay`).
+    """
 
     function: Callable[..., wp.array | tuple[wp.array, ...]]
-    dtypes: tuple[type, ...]
+    dtypes: Sequence[type]
     device: torch.device
-    names: tuple[str, ...]
-    affine: frozenset[str]
-    find_capture: FindCapture | None
+    names: Sequence[str]
+    affine: Collection[str]
+    find_replay: "Callable[[TensorFunction, Sequence[torch.Tensor], Sequence[bool]], Replay | None] | None" = None
+
+    def __call__(self, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """The results, a tuple also of one."""
+        wp.init()
+        if torch.get_num_threads() > 1:
+            _let_waiting_threads_sleep()
+        return _WarpFunction.apply(
+            self, tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in tensors), *tensors
+        )
+
+    def record(
+        self, arguments: Sequence[wp.array], requires_grad: Sequence[bool]
+    ) -> tuple[wp.Tape | None, tuple[wp.array, ...]]:
+        """Call it with arrays, on a tape if a gradient to any is asked for: the tape and the results."""
+        with recorded() if any(requires_grad) else unrecorded() as tape:
+            for argument, needs_gradient in zip(arguments, requires_grad, strict=True):
+                if needs_gradient:
+                    require_gradient(argument)  # here, so that a graph that is captured zeroes the gradient
+            results = self.function(*arguments)
+        return tape, results if isinstance(results, tuple) else (results,)
+
+    def results(self, tensors: Sequence[torch.Tensor], requires_grad: Sequence[bool]) -> CallResults:
+        """The results of a call, replayed where there are graphs for it."""
+        with one_call:
+            replay = self.find_replay and self.find_replay(self, tensors, requires_grad)
+            if replay:
+                return replay(tensors)
+        arguments = [as_array(*pair) for pair in zip(tensors, self.dtypes, strict=True)]
+        with one_call, current_stream(self.device):  # streams are the device's, as Warp has it, not a thread's
+            tape, results = self.record(arguments, requires_grad)
+        outputs = tuple(_as_tensor(result, self.device) for result in results)
+        playback = None if tape is None else _Playback(tape, arguments, results)
+        return CallResults(outputs, [result.requires_grad for result in results], playback)
 
     def change_along(
         self, tensors: Sequence[torch.Tensor], directions: Sequence[torch.Tensor | None]
@@ -213,18 +226,14 @@ class _Call:
                     "expected one of first order"
                     f"{f'; of second order there are those of {affine_names}' if affine_names else ''}"
                 )
-            ends = (self._results_at(tensors, number, end) for end in (direction, torch.zeros_like(direction)))
+            before, after = tensors[:number], tensors[number + 1 :]
+            ends = (self(*before, end, *after) for end in (direction, torch.zeros_like(direction)))
             change = [one - other for one, other in zip(*ends, strict=True)]
             total = [one + other for one, other in zip(total, change, strict=True)] if total else change
         return total
 
-    def _results_at(
-        self, tensors: Sequence[torch.Tensor], number: int, value: torch.Tensor
-    ) -> tuple[torch.Tensor, ...]:
-        """The results where one tensor has another value."""
-        arguments = [*tensors[:number], value, *tensors[number + 1 :]]
-        requires_grad = tuple(tensor.requires_grad and torch.is_grad_enabled() for tensor in arguments)
-        return _WarpFunction.apply(self, requires_grad, *arguments)
+
+Replay: TypeAlias = Callable[[Sequence[torch.Tensor]], CallResults]  # of a call whose graphs are known
 
 
 class _Playback:
@@ -258,36 +267,20 @@ class _WarpFunction(torch.autograd.Function):
     """Records Warp launches on a tape in forward and plays it back in backward."""
 
     @staticmethod
-    def forward(ctx, call: _Call, requires_grad: tuple[bool, ...], *tensors: torch.Tensor):
-        with one_call:
-            tensor_call = TensorCall(call.function, tensors, call.dtypes, requires_grad, call.device)
-            if call.find_capture is not None and (capture := call.find_capture(tensor_call)) is not None:
-                ctx.save_for_backward(*tensors)
-                outputs, ctx.playback = capture.replay(tensors)
-                ctx.call, varies = call, capture.results_require_grad
-                ctx.mark_non_differentiable(*(output for output, does in zip(outputs, varies, strict=True) if not does))
-                return outputs
-        arguments = [as_array(*pair) for pair in zip(tensors, call.dtypes, strict=True)]
-        # streams are the device's, as Warp has it, not a thread's
-        with one_call, current_stream(call.device), recorded() if any(requires_grad) else unrecorded() as tape:
-            for argument, needs_gradient in zip(arguments, requires_grad, strict=True):
-                if needs_gradient:
-                    require_gradient(argument)  # here, so that a graph that is captured zeroes the gradient
-            results = call.function(*arguments)
-        results = results if isinstance(results, tuple) else (results,)
-        outputs = tuple(_as_tensor(result, call.device) for result in results)
+    def forward(ctx, function: TensorFunction, requires_grad: tuple[bool, ...], *tensors: torch.Tensor):
+        results = function.results(tensors, requires_grad)
         if any(requires_grad):
             ctx.save_for_backward(*tensors)  # torch then notices if they change before backward
-            ctx.call, ctx.playback = call, _Playback(tape, arguments, results)
-            pairs = zip(outputs, results, strict=True)
-            ctx.mark_non_differentiable(*(output for output, result in pairs if not result.requires_grad))
-        return outputs
+            ctx.function, ctx.playback = function, results.playback
+            pairs = zip(results.tensors, results.require_grad, strict=True)
+            ctx.mark_non_differentiable(*(tensor for tensor, requires in pairs if not requires))
+        return results.tensors
 
     @staticmethod
     def backward(ctx, *adjoints: torch.Tensor):
         tensors = ctx.saved_tensors
         if torch.is_grad_enabled():  # create_graph=True
-            return None, None, *_WarpAdjoint.apply(ctx.call, ctx.playback, len(tensors), *tensors, *adjoints)
+            return None, None, *_WarpAdjoint.apply(ctx.function, ctx.playback, len(tensors), *tensors, *adjoints)
         return None, None, *ctx.playback(adjoints)
 
 
@@ -295,8 +288,8 @@ class _WarpAdjoint(torch.autograd.Function):
     """Gradients that may be differentiated again: d⟨v, Jᵀa⟩ = d⟨a, J v⟩, and J v of an affine function is one call."""
 
     @staticmethod
-    def forward(ctx, call: _Call, playback: Playback, count: int, *arguments: torch.Tensor):
-        ctx.call, ctx.count = call, count
+    def forward(ctx, function: TensorFunction, playback: Playback, count: int, *arguments: torch.Tensor):
+        ctx.function, ctx.count = function, count
         ctx.save_for_backward(*arguments)
         ctx.set_materialize_grads(False)
         return playback(arguments[count:])
@@ -307,7 +300,7 @@ class _WarpAdjoint(torch.autograd.Function):
         with torch.enable_grad():
             # views, so that gradients end here where one argument was computed from another
             arguments = [tensor.view_as(tensor) for tensor in ctx.saved_tensors]
-            changes = ctx.call.change_along(arguments[: ctx.count], directions)
+            changes = ctx.function.change_along(arguments[: ctx.count], directions)
             pairs = zip(arguments[ctx.count :], changes, strict=True)
             total = torch.stack([(adjoint * change).sum() for adjoint, change in pairs]).sum()
             variables = [tensor for tensor in arguments if tensor.requires_grad] if total.requires_grad else []

@@ -20,11 +20,12 @@ from warpshadow.scene.scene import BodyLike, PerBody
 from warpshadow.torch.autograd import check_float32, outside_torch_compile
 from warpshadow.torch.renderer import TorchRenderer
 
-_CAMERAS = "clip_matrices=renderer.clip_matrices(R, t, K), R, t and K of renderer.scene_cameras(), one for each image"
-_PLACED = "geometry=renderer.placed(which, rotations, translations)"
 _KEYWORD_REMEDIES = {
-    **dict.fromkeys(("camera", "cameras"), _CAMERAS),
-    **dict.fromkeys(("poses", "rotations", "translations"), _PLACED),
+    **dict.fromkeys(
+        ("camera", "cameras"),
+        "clip_matrices=renderer.clip_matrices(R, t, K), R, t and K of renderer.scene_cameras(), one for each image",
+    ),
+    **dict.fromkeys(("poses", "rotations", "translations"), "geometry=renderer.placed(which, rotations, translations)"),
     "envmap": "light=",
 }
 """Remedies for keywords that a call does not have."""
@@ -98,26 +99,19 @@ class MixedRenderer(torch.nn.Module):
         Differentiable: all but which.
         """
         batch = _Batch(which, len(self.renderers))
-        of_images = {name: batch.split(name, *entry) for name, entry in inputs.of_images.items()}
-        of_bodies = {
-            name: {
-                body: self._split_item(batch, name, body, tensor)
-                for body, tensor in self._by_body(name, values).items()
-            }
-            for name, values in inputs.of_bodies.items()
-        }
+        arguments: dict[int, dict[str, Any]] = {scene: {} for scene in batch.rows}
+        for name, entry in inputs.of_images.items():
+            for scene, part in batch.split(name, *entry).items():
+                arguments[scene][name] = part
+        for name, values in inputs.of_bodies.items():
+            for body, tensor in self._by_body(name, values).items():
+                for scene, part in self._split_item(batch, name, body, tensor).items():
+                    arguments[scene].setdefault(name, {})[body] = part
         geometries = batch.of_scenes(inputs.geometry)
         return batch.join(
             {
-                scene: self._renderer(scene)(
-                    **{name: parts[scene] for name, parts in of_images.items()},
-                    **{
-                        name: {body: parts[scene] for body, parts in items.items() if scene in parts}
-                        for name, items in of_bodies.items()
-                    },
-                    geometry=geometries[scene],
-                )
-                for scene in batch.rows
+                scene: self._renderer(scene)(geometry=geometries[scene], **arguments_of_scene)
+                for scene, arguments_of_scene in arguments.items()
             }
         )
 
@@ -242,10 +236,9 @@ class MixedRenderer(torch.nn.Module):
             parts = batch.split(name, tensor, ndim + 1)
             return {scene: parts[scene] for scene in counts}
         if body_input.is_color and len(shape) > 1 and shape[-2] != 1:
-            meaning = f"or one color; the mesh with the most vertices has {maximum}"
-            check.shape(name, shape, (maximum, 3) if len(shape) == 2 else ("batch", maximum, 3), meaning)
+            _check_padded(name, tensor, (maximum, 3), f"or one color; the mesh with the most vertices has {maximum}")
         elif not body_input.is_color and len(shape) == 1 and shape[0] != 1:
-            check.shape(name, shape, (maximum,), "or one number, or an image")
+            _check_padded(name, tensor, (maximum,), "or one number, or an image")
         return batch.split(name, tensor, ndim, counts)
 
     def _split_poses(
@@ -255,11 +248,14 @@ class MixedRenderer(torch.nn.Module):
         if poses is None:
             return dict.fromkeys(batch.rows)
         check_float32(name, poses)
-        shape = self._body_count, *item
-        expected: tuple[int | str, ...] = shape if poses.ndim <= len(shape) else ("batch", *shape)
-        check.shape(name, tuple(poses.shape), expected, "for as many bodies as the scene with the most has")
+        _check_padded(name, poses, (self._body_count, *item), "for as many bodies as the scene with the most has")
         counts = {scene: len(self._renderer(scene).scene.bodies) for scene in batch.rows}
-        return batch.split(name, poses, len(shape), counts)
+        return batch.split(name, poses, 1 + len(item), counts)
+
+
+def _check_padded(name: str, tensor: torch.Tensor, shape: tuple[int, ...], meaning: str) -> None:
+    """Raise ValueError unless a tensor has a shape, or is a batch of it."""
+    check.shape(name, tuple(tensor.shape), shape if tensor.ndim <= len(shape) else ("batch", *shape), meaning)
 
 
 class _Batch:

@@ -185,13 +185,8 @@ class TorchRenderer(torch.nn.Module):
             others raise NotImplementedError then.
         """
         arguments, slots = self._slots_of(inputs)
-        is_affine = {
-            "light": True,
-            "emission": True,
-            "albedo": not self.scene.bounces,
-            "textures": not self.scene.bounces,
-        }
-        affine = [name for name in arguments.names if is_affine.get(name.partition("[")[0])]
+        affine_inputs = ("light", "emission") if self.scene.bounces else ("light", "emission", "albedo", "textures")
+        affine = [name for name in arguments.names if name.startswith(affine_inputs)]
         return arguments.apply(self.array_renderer.draw_inputs, slots, affine=affine, replays=self.replays)
 
     @outside_torch_compile

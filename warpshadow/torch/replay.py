@@ -23,9 +23,17 @@ import warp as wp
 
 from warpshadow.device import cuda_graph
 from warpshadow.device.constants import collecting_constants
-from warpshadow.device.memory import require_gradient
-from warpshadow.device.tape import recorded, unrecorded
-from warpshadow.torch.autograd import Playback, TensorCall, array_of, as_array, current_stream, is_capturing, tensor_of
+from warpshadow.device.tape import unrecorded
+from warpshadow.torch.autograd import (
+    CallResults,
+    Replay,
+    TensorFunction,
+    array_of,
+    as_array,
+    current_stream,
+    is_capturing,
+    tensor_of,
+)
 
 _PLAIN_CALLS = 2  # of a kind before it is captured: the first compiles kernels and fills caches, as may the second
 _MAX_FAILURES = 2  # after which calls of a kind stay plain
@@ -44,25 +52,32 @@ class Replays:
         """Copies begin anew."""
         return functools.partial(Replays, is_on=self.is_on), ()
 
-    def find(self, key_of: Callable[[], Hashable], reused: Collection[int], call: TensorCall) -> Capture | None:
-        """Find or make the capture of a call; None if it is to be plain.
+    def find(
+        self,
+        key_of: Callable[[], Hashable],
+        reused: Collection[int],
+        function: TensorFunction,
+        tensors: Sequence[torch.Tensor],
+        requires_grad: Sequence[bool],
+    ) -> Replay | None:
+        """Find or make the capture of a call of a function; None if the call is to be plain.
 
         Args:
             key_of: Makes the key of the arguments of the call but the tensors.
             reused: Indices of tensors about which results are cached while they stay the same.
-            call: The call.
         """
-        capture, self.reason = None, self._why_plain(call.device)
-        if not self.reason:
-            pairs = zip(call.tensors, call.requires_grad, strict=True)
-            call_key = str(call.device), key_of(), tuple((tuple(tensor.shape), needs) for tensor, needs in pairs)
-            history = self._histories.pop(call_key, None) or _CallHistory()
-            self._histories[call_key] = history  # the last that was used
-            while len(self._histories) > _MAX_HISTORIES:
-                del self._histories[next(iter(self._histories))]
-            unchanged = [call.tensors[number] for number in reused if not call.requires_grad[number]]
-            capture, self.reason = history.find(call, unchanged)
-        return capture
+        self.reason = self._why_plain(function.device)
+        if self.reason:
+            return None
+        pairs = zip(tensors, requires_grad, strict=True)
+        call_key = str(function.device), key_of(), tuple((tuple(tensor.shape), needs) for tensor, needs in pairs)
+        history = self._histories.pop(call_key, None) or _CallHistory()
+        self._histories[call_key] = history  # the last that was used
+        while len(self._histories) > _MAX_HISTORIES:
+            del self._histories[next(iter(self._histories))]
+        unchanged = [tensors[number] for number in reused if not requires_grad[number]]
+        replay, self.reason = history.find(function, tensors, requires_grad, unchanged)
+        return replay
 
     def _why_plain(self, device: torch.device) -> str:
         if not self.is_on:
@@ -82,8 +97,14 @@ class _CallHistory:
         self._unchanged: list[torch.Tensor] = []  # of the last call: held, so that no other lies where they did
         self._versions: list[tuple[int, int]] | None = None  # of these
 
-    def find(self, call: TensorCall, unchanged: Sequence[torch.Tensor]) -> tuple[Capture | None, str]:
-        """The capture, or why there is none."""
+    def find(
+        self,
+        function: TensorFunction,
+        tensors: Sequence[torch.Tensor],
+        requires_grad: Sequence[bool],
+        unchanged: Sequence[torch.Tensor],
+    ) -> tuple[Replay | None, str]:
+        """The replay of the capture, or why there is none."""
         before, self._versions = self._versions, [(tensor.data_ptr(), tensor._version) for tensor in unchanged]
         self._unchanged = [tensor.detach() for tensor in unchanged]
         if unchanged and self._versions == before:
@@ -95,7 +116,7 @@ class _CallHistory:
             return None, "calls of this kind have not come often enough"
         if self._capture is None:
             try:
-                capture = Capture(call)
+                capture = Capture(function, tensors, requires_grad)
             except (RuntimeError, MemoryError) as error:  # such as for a constant that is missing: plain calls make it
                 self._plain_calls, self._failures = 0, self._failures + 1
                 self._failure = f"it cannot be captured: {error}"
@@ -106,7 +127,7 @@ class _CallHistory:
                 self._failure = f"its graph takes {milliseconds[0]}, a plain call {milliseconds[1]}"
                 return None, self._failure
             self._capture = capture
-        return self._capture, ""
+        return self._capture.replay, ""
 
 
 class Capture:
@@ -119,30 +140,22 @@ class Capture:
         seconds, plain_seconds: How long it takes forward as a graph, and as a plain call.
     """
 
-    def __init__(self, call: TensorCall):
-        function, tensors, dtypes, requires_grad, device = call
-        self._device = device
+    def __init__(self, function: TensorFunction, tensors: Sequence[torch.Tensor], requires_grad: Sequence[bool]):
+        self._device = function.device
         self._inputs = [tensor.detach().clone(memory_format=torch.contiguous_format) for tensor in tensors]
-        self._arguments = [as_array(*pair) for pair in zip(self._inputs, dtypes, strict=True)]
+        self._arguments = [as_array(*pair) for pair in zip(self._inputs, function.dtypes, strict=True)]
         self._state = 0  # counts replays; gradients are of the last
         self._backward: wp.Graph | None = None
-        warp_device = wp.device_from_torch(device)
+        warp_device = wp.device_from_torch(function.device)
         if warp_device.is_cuda and not wp.is_mempool_enabled(warp_device):
             raise RuntimeError(f"{warp_device} has no memory pool (wp.set_mempool_enabled)")
-        with current_stream(device), unrecorded():
-            self.plain_seconds = self._seconds_of(lambda: function(*self._arguments))
+        with current_stream(function.device), unrecorded():
+            self.plain_seconds = self._seconds_of(lambda: function.function(*self._arguments))
         with collecting_constants() as self._cached_values:
-            with (
-                wp.ScopedCapture(device=warp_device) as capture,
-                recorded() if any(requires_grad) else unrecorded() as tape,
-            ):
-                for argument, needs_gradient in zip(self._arguments, requires_grad, strict=True):
-                    if needs_gradient:
-                        require_gradient(argument)  # by the graph, which zeroes it
-                results = function(*self._arguments)
-            self._forward, self._tape = capture.graph, tape
-            self._results = results if isinstance(results, tuple) else (results,)
-            if tape is not None:
+            with wp.ScopedCapture(device=warp_device) as capture:
+                self._tape, self._results = function.record(self._arguments, requires_grad)  # zeroes gradients, too
+            self._forward = capture.graph
+            if self._tape is not None:
                 self._adjoints = [torch.zeros_like(tensor_of(result)) for result in self._results]
                 sources = [
                     array_of(adjoint, result.dtype)
@@ -152,9 +165,9 @@ class Capture:
                     for result, source in zip(self._results, sources, strict=True):
                         if result.requires_grad:
                             wp.copy(result.grad, source)
-                    tape.backward()
+                    self._tape.backward()
                 self._backward = capture.graph
-        with current_stream(device):
+        with current_stream(function.device):
             self.seconds = min(self._seconds_of(lambda: wp.capture_launch(self._forward)) for _ in range(2))
 
     def _seconds_of(self, run: Callable[[], object]) -> float:
@@ -165,17 +178,13 @@ class Capture:
         wp.synchronize_device(wp.device_from_torch(self._device))
         return time.perf_counter() - start
 
-    @property
-    def results_require_grad(self) -> list[bool]:
-        """Whether each result depends on tensors that require a gradient."""
-        return [result.requires_grad for result in self._results]
-
-    def replay(self, tensors: Sequence[torch.Tensor]) -> tuple[tuple[torch.Tensor, ...], Playback]:
-        """Replay it forward: the results, and the call for its gradients."""
+    def replay(self, tensors: Sequence[torch.Tensor]) -> CallResults:
+        """Replay it forward."""
         self._launch_forward(tensors)
         with current_stream(self._device):
             results = tuple(tensor_of(result).clone() for result in self._results)
-        return results, functools.partial(self._gradients, [tensor.detach() for tensor in tensors], self._state)
+        playback = functools.partial(self._gradients, [tensor.detach() for tensor in tensors], self._state)
+        return CallResults(results, [result.requires_grad for result in self._results], playback)
 
     def _launch_forward(self, tensors: Sequence[torch.Tensor]) -> None:
         for unchanged, tensor in zip(self._inputs, tensors, strict=True):

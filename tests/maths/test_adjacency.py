@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import warpshadow as ws
-from warpshadow.maths.solid_angle import solid_angles
+from warpshadow.maths.adjacency import solid_angles
 
 
 def test_an_octant_is_an_eighth_of_the_sphere_however_far():
