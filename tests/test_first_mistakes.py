@@ -184,6 +184,33 @@ def test_names_that_arrays_of_a_mesh_have_elsewhere_get_theirs():
     assert (copy.deepcopy(BALL.mesh).positions == BALL.mesh.positions).all()
 
 
+def test_a_picture_says_how_it_is_written():
+    with pytest.raises(AttributeError, match=r"a Picture has no 'save' \(write write\(path\)\)"):
+        ws.Picture([[1.0]]).save("picture.png")
+
+
+def test_a_scene_gives_a_body_by_its_name_or_number():
+    named = dataclasses.replace(BALL, name="ball")
+    scene = dataclasses.replace(SCENE, bodies=(BALL, named))
+    assert scene["ball"] is scene.bodies[1] and scene[0] is scene.bodies[0]
+    with pytest.raises(ValueError, match="body: got 'bal', expected one of"):
+        scene["bal"]
+    with pytest.raises(TypeError, match="not iterable"):
+        list(scene)
+
+
+def test_a_size_of_one_number_is_that_of_a_square():
+    one, two = (ws.Camera.framing(BALL, size=size) for size in (8, (8, 8)))
+    assert repr(one) == repr(two) and (one.intrinsics == two.intrinsics).all()
+    with pytest.raises(ValueError, match="size: got 'big', expected width and height .*, or a square's width"):
+        ws.Camera.framing(BALL, size="big")
+
+
+def test_a_folder_is_no_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match="mesh: no such file: .*, which is a folder"):
+        ws.Body(tmp_path)
+
+
 def test_functions_that_are_looked_for_in_the_wrong_place_are_named():
     for name in ("render", "explain", "tune", "view", "fit"):
         with pytest.raises(AttributeError, match=rf"a Scene has no '{name}' \(write .*scene"):

@@ -251,7 +251,8 @@ def file(name: str, value: AnyPath) -> Path:
     result = Path(value)
     if not result.is_file():
         where = "" if result.is_absolute() else f" (in {Path.cwd()})"
-        raise FileNotFoundError(f"{name}: no such file: {result}{where}{nearest_file(result)}")
+        hint = ", which is a folder" if result.is_dir() else nearest_file(result)
+        raise FileNotFoundError(f"{name}: no such file: {result}{where}{hint}")
     return result
 
 
@@ -367,9 +368,13 @@ def flag(name: str, value: object) -> bool:
 
 
 def image_size(size: object) -> tuple[int, int]:
-    """Return width and height [pixels], or raise ValueError."""
+    """Return width and height [pixels], of a square for one number, or raise ValueError."""
+    if is_number(size):
+        size = size, size
     if not isinstance(size, (Sequence, np.ndarray)) or isinstance(size, str) or len(size) != 2:
-        raise ValueError(f"size: got {described(size)}, expected width and height [pixels], such as (640, 480)")
+        raise ValueError(
+            f"size: got {described(size)}, expected width and height [pixels], such as (640, 480), or a square's width"
+        )
     return integer("size (width)", size[0], unit="pixels"), integer("size (height)", size[1], unit="pixels")
 
 
@@ -386,9 +391,12 @@ def pixels(name: str, values: object, *, expected: str, error: type[ValueError] 
 
 
 def photograph(name: str, values: object) -> np.ndarray:
-    """Copy linear values of a photograph as :func:`pixels` does; codes of a picture are refused as floats, too."""
+    """Copy linear values of a photograph as :func:`pixels` does; codes of a picture are refused as floats, too.
+
+    Those are whole numbers whose largest is 128 to 255, as in all but dark pictures.
+    """
     copied = pixels(name, values, expected="linear RGB [height, width, 3], or the path of a picture")
-    if copied.size and np.ptp(copied) > 0 and 16 < copied.max() <= 255 and (copied == np.rint(copied)).all():
+    if copied.size and np.ptp(copied) > 0 and 128 <= copied.max() <= 255 and (copied == np.rint(copied)).all():
         raise ValueError(
             f"{name}: got whole numbers up to {copied.max():g}, expected linear values: those of an 8-bit picture are "
             "warpshadow.srgb_to_linear(values / 255), and read_image(path) reads one"

@@ -209,6 +209,19 @@ def test_the_time_that_is_left_is_that_of_the_work_under_way(monkeypatch):
     assert wait.line() == "fitting: 10 of 20 steps, 70 s, 10 s left"
 
 
+def test_the_time_that_is_left_leaves_out_that_of_kernels(monkeypatch):
+    """The first of twenty steps took 50 s, 48 of them to compile kernels."""
+    now = 0.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    monkeypatch.setattr(progress, "_compile_seconds", 7.0)  # of an earlier wait
+    wait = progress.Wait("fitting", 20, "step")
+    with progress._compiling():
+        now = 48.0
+    now = 50.0
+    wait.update(1)
+    assert wait.line() == "fitting: 1 of 20 steps, 50 s, 38 s left"
+
+
 def test_a_bar_ends_where_less_was_to_do(terminal, no_delay):
     with progress_bar(100, "fitting", "it", stays=True) as bar:
         bar.update(30)

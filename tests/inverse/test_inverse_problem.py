@@ -29,7 +29,7 @@ from warpshadow.inverse import (
 from warpshadow.inverse.target import stack_targets
 
 CPU = torch.device("cpu")
-CODES = np.arange(60, dtype=np.float32).reshape(4, 5, 3)
+CODES = 3 * np.arange(60, dtype=np.float32).reshape(4, 5, 3)
 
 
 def small_scene(*, size: tuple[int, int] = (24, 24), **visibility) -> ws.Scene:
@@ -63,8 +63,8 @@ def noise(*shape: int, seed: int = 0) -> np.ndarray:
         ({"image": np.zeros((4, 5, 3), bool)}, "image: got ndarray of bool"),
         ({"image": np.zeros((3, 4, 5))}, r"image: got shape \(3, 4, 5\), .*: channels come last"),
         ({"image": None}, "image: got None, expected linear RGB"),
-        ({"image": CODES}, r"image: got whole numbers up to 59, .*srgb_to_linear\(values / 255\)"),
-        ({"image": torch.tensor(CODES)}, r"image: got whole numbers up to 59, .*srgb_to_linear\(values / 255\)"),
+        ({"image": CODES}, r"image: got whole numbers up to 177, .*srgb_to_linear\(values / 255\)"),
+        ({"image": torch.tensor(CODES)}, r"image: got whole numbers up to 177, .*srgb_to_linear\(values / 255\)"),
         ({"mask": np.full((4, 5), 255, np.uint8)}, "mask: got values from 255 to 255, .*mask / 255"),
         ({"mask": "x"}, "mask: no such file: x"),
         ({"camera": "front"}, "camera: got 'front', expected a Camera"),

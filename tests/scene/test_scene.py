@@ -224,7 +224,7 @@ NOT_POSITIVE = ("0", "-1")
         ("camera", "up", NOT_THREE_NUMBERS),
         ("camera", "fov_y", (*NOT_A_NUMBER, *NOT_POSITIVE, "180")),
         ("camera", "near", (*NOT_A_NUMBER, *NOT_POSITIVE)),
-        ("camera", "size", ("8", '"8"', "[8]", "[8, 8, 8]", "[8, 8.5]", "[8, true]", '[8, "8"]', "[8, [8]]", "[8, 0]")),
+        ("camera", "size", ('"8"', "[8]", "[8, 8, 8]", "[8, 8.5]", "[8, true]", '[8, "8"]', "[8, [8]]", "[8, 0]")),
         ("camera", "supersampling", (*NOT_WHOLE, "0", "17")),
         ("light", "bounces", (*NOT_WHOLE, "-1", "17")),
         ("light", "scale", (*NOT_A_NUMBER, "-1")),

@@ -25,6 +25,8 @@ from warpshadow.assets import camera_conventions
 from warpshadow.assets.camera_conventions import Y_DOWN
 from warpshadow.maths.plane import is_flat
 
+ImageSize = int | tuple[int, int]  # width and height [pixels]; one number for a square
+
 # Rotations read from a file are often rounded to six digits.
 _ROTATION_TOLERANCE = 1e-4
 
@@ -125,7 +127,7 @@ class Camera:
         *,
         up: npt.ArrayLike = (0.0, 1.0, 0.0),
         fov_y: float = 40.0,
-        size: tuple[int, int] = (256, 256),
+        size: ImageSize = (256, 256),
         near: float = 0.01,
     ) -> Camera:
         """Place a camera with square pixels at ``eye`` so that ``target`` lies in the middle of the image.
@@ -135,6 +137,7 @@ class Camera:
             target: Point looked at [scene units], shape [3].
             up: Direction that points up in the image, shape [3], any length.
             fov_y: Angle between the top and the bottom edge of the image [degrees], between 0 and 180.
+            size: Width and height [pixels], or one number for both.
         Raises:
             ValueError: when eye and target coincide or up is parallel to the view.
         """
@@ -156,7 +159,7 @@ class Camera:
         direction: npt.ArrayLike = DIRECTION,
         up: npt.ArrayLike = (0.0, 1.0, 0.0),
         fov_y: float = 40.0,
-        size: tuple[int, int] = (256, 256),
+        size: ImageSize = (256, 256),
         margin: float = 0.2,
         near: float | None = None,
     ) -> Camera:
@@ -166,7 +169,7 @@ class Camera:
             shown: A mesh, a body, several, or a scene. Flat ones, grounds and walls, count where all are flat.
             direction: From the framed bodies to the camera, shape [3], any length; the default looks down from the
                 front.
-            up, fov_y: As of :meth:`look_at`.
+            up, fov_y, size: As of :meth:`look_at`.
             margin: Fraction of the image that stays free around the framed bodies, 0 or more and below 1; leave some
                 for shadows.
             near: Distance of the near plane [scene units]; by default 1% of the distance to the framed bodies.
@@ -234,7 +237,7 @@ class Camera:
         principal_point: npt.ArrayLike | None = None,
         *,
         fov: float | None = None,
-        size: tuple[int, int] = (256, 256),
+        size: ImageSize = (256, 256),
         in_ndc: bool = True,
         near: float = 0.01,
     ) -> Camera:
@@ -246,7 +249,7 @@ class Camera:
             focal_length: Of ``PerspectiveCameras``, one number or one for x and one for y.
             principal_point: Of ``PerspectiveCameras``, [2] or [1, 2]; by default the middle of the image.
             fov: In place of ``focal_length``: that of ``FoVPerspectiveCameras`` [degrees], across the shorter side.
-            size: Width and height [pixels] (PyTorch3D's ``image_size`` is height and width).
+            size: Width and height [pixels], or one number for both (PyTorch3D's ``image_size`` is height and width).
             in_ndc: Whether focal length and principal point are in NDC, ±1 at the ends of the shorter side, +x left and
                 +y up; else in pixels, +x right and +y down.
         """
@@ -262,7 +265,7 @@ class Camera:
         tvec: npt.ArrayLike,
         model: str,
         params: npt.ArrayLike,
-        size: tuple[int, int],
+        size: ImageSize,
         *,
         near: float = 0.01,
     ) -> Camera:
@@ -284,7 +287,7 @@ class Camera:
         projection: npt.ArrayLike | None = None,
         *,
         fov_y: float | None = None,
-        size: tuple[int, int] = (256, 256),
+        size: ImageSize = (256, 256),
         near: float | None = None,
     ) -> Camera:
         """Convert an OpenGL camera (x right, y up, z backward; column vectors; image origin at the bottom).

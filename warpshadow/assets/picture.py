@@ -3,7 +3,7 @@
 import io
 import re
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -83,6 +83,13 @@ class Picture:
     def __repr__(self) -> str:
         height, width, _ = self.pixels.shape
         return f"Picture({width} × {height}, {self.exposure:+.2f} stops)"
+
+    if not TYPE_CHECKING:  # to which it would hide names that there are not
+
+        def __getattr__(self, name: str) -> Any:
+            """Map names of other libraries to ours."""
+            hint = {"save": "write(path)", "show": "write(path); notebooks draw a Picture by themselves"}.get(name)
+            raise AttributeError(f"a Picture has no {name!r}{hint and f' (write {hint})' or ''}")
 
     def _repr_png_(self) -> bytes:
         """The picture as notebooks draw it."""

@@ -102,6 +102,7 @@ class Wait:
         self.bar: Any = None  # tqdm's, where it shows one
         self._start = time.monotonic()
         self._done_at_start, self._label_start = done, self._start  # of the work that the label names
+        self._compiled_at_start = _compile_seconds
 
     @property
     def age(self) -> float:
@@ -129,6 +130,7 @@ class Wait:
         """Label the bar, from its next update, with the work under way, which has a pace of its own, and a remark."""
         if label != self.label:
             self._done_at_start, self._label_start = self.done, time.monotonic()
+            self._compiled_at_start = _compile_seconds
         self.label, self.remark = label, remark
         if self.bar is not None:
             self.bar.set_description_str(label, refresh=False)
@@ -140,7 +142,8 @@ class Wait:
         if self.unit and self.total is not None:
             parts.insert(0, f"{self.done:,} of {self.total:,} {self.unit}s")
             if self.done > self._done_at_start:
-                age = time.monotonic() - self._label_start
+                compiling = _compile_seconds - self._compiled_at_start  # once: it tells nothing of the steps to come
+                age = max(time.monotonic() - self._label_start - compiling, 0.0)
                 left = age * max(self.total - self.done, 0) / (self.done - self._done_at_start)
                 parts.append(f"{show_time(left)} left")
         if self.remark:
@@ -280,13 +283,20 @@ def progress_bar(
 
 
 _module_numbers = itertools.count(1)
+_compile_seconds = 0.0  # that kernels took to compile in this process [s]
 
 
-def _compiling() -> contextlib.AbstractContextManager:
+@contextlib.contextmanager
+def _compiling() -> Iterator[None]:
     """Say that kernels are compiled, and the number of their module in this process."""
-    return progress_bar(
-        None, f"compiling kernels, module {next(_module_numbers)}", "", shows=not _this_thread.is_hidden
-    )
+    global _compile_seconds
+    start = time.monotonic()
+    label = f"compiling kernels, module {next(_module_numbers)}"
+    try:
+        with progress_bar(None, label, "", shows=not _this_thread.is_hidden):
+            yield
+    finally:
+        _compile_seconds += time.monotonic() - start
 
 
 around_compilation(_compiling)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warpshadow import check
-from warpshadow.assets.camera import DIRECTION, Camera
+from warpshadow.assets.camera import DIRECTION, Camera, ImageSize
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.assets.mesh import Mesh
 from warpshadow.assets.mesh_files import MeshSource
@@ -79,7 +79,7 @@ def default_scene(
     body: Body | Mesh | MeshSource,
     *,
     up: str = GUESSED_AXIS,
-    size: tuple[int, int] = (256, 256),
+    size: ImageSize = (256, 256),
     light: EnvironmentMap | AnyPath | None = None,
     direction: npt.ArrayLike = DIRECTION,
 ) -> Scene:
@@ -91,7 +91,7 @@ def default_scene(
             Where it is a metal, light bounces once, so that it reflects the ground.
         up: Axis of the mesh that points up, "y" or "z"; by default "guess", which :func:`guess_up` finds by its shape
             and its file, as the commands do. A warning says so where that is z.
-        size: Width and height of the image [pixels].
+        size: Width and height of the image [pixels], or one number for both.
         light: In place of the sky: an environment map, or the file of one.
         direction: From the body's middle to the camera, in the world, whose y is up, shape [3], any length.
     """

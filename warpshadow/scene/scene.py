@@ -283,6 +283,12 @@ class Scene:
             hint = FUNCTIONS_OF_SCENES.get(name)
             raise AttributeError(f"a Scene has no {name!r}{f' (write {hint})' if hint else ''}")
 
+    def __getitem__(self, body: BodyLike) -> Body:
+        """A body, given its number or name."""
+        return self.bodies[self.body_number(body)]
+
+    __iter__ = None  # one goes over scene.bodies
+
     def __repr__(self) -> str:
         bounces = f", {self.bounces} bounces" if self.bounces else ""
         bodies = ", ".join(map(repr, self.bodies))

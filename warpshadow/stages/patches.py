@@ -342,7 +342,7 @@ def _find_outside(mesh: wp.Mesh, corners: np.ndarray, lift: float) -> tuple[np.n
             (points + lift * normals[pieces]).astype(np.float32),
             normals[pieces].astype(np.float32),
         )
-        return find_buried(mesh, lifted_points, lifted_normals, len(lifted_points))
+        return find_buried(mesh, lifted_points, lifted_normals)
 
     is_inside = is_buried(centroids, np.arange(len(corners)))
     if is_inside.all():

@@ -9,7 +9,7 @@ from warpshadow.scene.blockers import fitted_meshes
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import SHARED_DIRECTIONS
 from warpshadow.spheres.fit import fit_seconds, is_fitted
-from warpshadow.stages.self_visibility.trace import trace_seconds
+from warpshadow.stages.self_visibility.trace import ray_count, trace_seconds
 
 _BUNNY_FACES = 12_200
 _STILL_PIXEL_SECONDS = 2.8e-5
@@ -25,7 +25,8 @@ def setup_seconds(scene: Scene, *, device: wp.DeviceLike = "cpu") -> float:
     seconds = 0.0
     for fit in set(fitted_meshes(scene).values()):
         if not is_fitted(*fit, device=device):
-            seconds += fit_seconds(fit.sphere_count) + trace_seconds(fit.mesh.vertex_count, fit.mesh.face_count)
+            rays = fit.mesh.vertex_count * ray_count(fit.mesh.vertex_count)
+            seconds += fit_seconds(fit.sphere_count) + trace_seconds(rays, fit.mesh.face_count)
     return seconds
 
 

@@ -346,6 +346,34 @@ def test_what_was_traced_at_an_interrupt_is_not_traced_again(tmp_path, monkeypat
     assert not blocks
 
 
+@pytest.mark.parametrize("receivers", ["vertex", "pixel"])
+def test_backs_of_an_open_body_are_traced_once_they_are_seen(tmp_path, monkeypatch, receivers):
+    shell = cup()
+    open_below = ws.Mesh(shell.positions, shell.faces[shell.positions[shell.faces, 1].mean(axis=1) > -0.7])
+
+    def images(cache: str) -> tuple[list[np.ndarray], list[int]]:
+        monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path / cache))
+        mesh = ws.Mesh(open_below.positions, open_below.faces)  # nothing of it is in memory
+        scene = scene_of(receivers)
+        renderer = SceneRenderer(dataclasses.replace(scene, bodies=(ws.Body(mesh, blockers=12, receivers=receivers),)))
+        found, counts = [], []
+        poses = renderer.scene_poses()
+        for half_turn in (np.eye(3), np.diag([1.0, -1.0, -1.0]), np.eye(3)):
+            rotations = wp.array(half_turn @ poses.rotations.numpy(), dtype=wp.mat33)
+            geometry = renderer.placed(Poses(rotations, poses.translations, poses.scales))
+            found.append(renderer.draw(view=renderer.view(geometry)).numpy())
+            counts.append(len(cached_files("self_shadows")))
+        return found, counts
+
+    some, counts = images("once seen")
+    assert counts == [1, 2, 2]
+    monkeypatch.setattr(self_visibility, "is_readable", lambda device: False)
+    all_of_them, counts = images("at once")
+    assert counts == [2, 2, 2]
+    np.testing.assert_array_equal(some, all_of_them)
+    assert np.abs(some[0] - some[1]).max() > 0.1
+
+
 def test_a_damaged_file_of_an_interrupt_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
     path = cache_path("self_shadows", "0" * 64)
@@ -358,7 +386,7 @@ def test_a_damaged_file_of_an_interrupt_is_not_read(tmp_path, monkeypatch):
 def test_rows_that_take_long_to_trace_are_announced_with_the_way_around_them(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(progress, "ANNOUNCED_SECONDS", 1.0)
-    monkeypatch.setattr(self_visibility, "trace_seconds", lambda rows, faces: rows)
+    monkeypatch.setattr(self_visibility, "trace_seconds", lambda rays, faces, are_backs: rays / 4096)
     monkeypatch.setenv("WARPSHADOW_NUM_THREADS", "2")
     SceneRenderer(scene_of(), progress=True).render()
     said = capsys.readouterr().err

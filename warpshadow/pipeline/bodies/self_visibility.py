@@ -19,7 +19,8 @@ from warpshadow import check
 from warpshadow.assets.cache import Unfinished, cache_path, load_or_compute
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.batch import cut
-from warpshadow.device.memory import from_numpy
+from warpshadow.device.cuda_graph import is_readable
+from warpshadow.device.memory import from_numpy, zeros
 from warpshadow.device.progress import announce
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.bodies.geometry import Geometry
@@ -61,7 +62,8 @@ from warpshadow.stages.self_visibility.trace import (
     trace_seconds,
 )
 
-VERSION = 6  # part of the key of cached rows: raise it whenever they would come out differently
+VERSION = 7  # part of the key of cached rows: raise it whenever they would come out differently
+_FRONT, _BACK = 1, -1  # sides of a body, as signs of the normals of its probes
 FREE_SHAPE = "its shape is free"  # why a body of free shape blocks its own light, and that of others, by spheres
 
 
@@ -75,6 +77,7 @@ class SelfVisibilityLookup(NamedTuple):
     """Self-visibility lookups of a body's receivers."""
 
     rows: VisibilityRows
+    trace_seen_backs: Callable[[ProbeWeights], None]  # fills rows of backs on which receivers lie
     lookup: ResamplingWeights
     kernels: ResamplingKernels
     rays: tuple[RayProbes, wp.array] | None = None  # for a sun, and the rotations; None where it is looked up, too
@@ -86,6 +89,7 @@ class SelfVisibilityLookup(NamedTuple):
 
     def transmittance(self, normals: wp.array, weights: ProbeWeights) -> wp.array:
         """Transmittance of receivers past their body, [batch, receiver, cell]."""
+        self.trace_seen_backs(weights)
         return gather_self_transmittance(normals, weights, self.lookup, self.kernels, self.rows)
 
 
@@ -233,9 +237,9 @@ class SelfVisibility:
                 rows = self.rows(body)
                 kernels = find_resampling_kernels(directions, half_angles, rows.ray_count, rotations.device)
                 rays = (self._ray_probes(body), rotations) if has_sun and self._sends_rays(body) else None
-                result[body] = SelfVisibilityLookup(
-                    rows, find_resampling_weights(rotations, body, kernels), kernels, rays
-                )
+                resampling_weights = find_resampling_weights(rotations, body, kernels)
+                trace_seen_backs = functools.partial(self._trace_seen_backs, body)
+                result[body] = SelfVisibilityLookup(rows, trace_seen_backs, resampling_weights, kernels, rays)
         return result
 
     def _ray_probes(self, body: int) -> RayProbes:
@@ -265,6 +269,7 @@ class SelfVisibility:
 
     def _lobes_of(self, body: int, order: int) -> wp.array:
         if (body, order) not in self._lobes:
+            self._trace_backs(body)
             self._lobes[body, order] = project_rows(self.rows(body), self._normals(body), order)
         return self._lobes[body, order]
 
@@ -278,32 +283,63 @@ class SelfVisibility:
         scene = self._merged_scene.scene
         solids = find_solids(scene, blocking_parts(scene))
         traced = (body for body, is_flat in enumerate(self._merged_scene.is_flat) if not (is_flat or body in solids))
-        return all(self._rows_path(body).exists() for body in traced if not self.why_spheres(body, None))
+        return all(self._rows_path(body, _FRONT).exists() for body in traced if not self.why_spheres(body, None))
 
     def _row_count(self, body: int) -> int:
         return len(self.probes(body).positions) * (1 + bool(self._merged_scene.is_two_sided[body]))
 
     def _normals(self, body: int) -> np.ndarray:
         """Normals of the probes of a body, and of their backs if it is open."""
-        sides = (1, -1) if self._merged_scene.is_two_sided[body] else (1,)
+        sides = (_FRONT, _BACK) if self._merged_scene.is_two_sided[body] else (_FRONT,)
         return np.concatenate([side * self.probes(body).normals for side in sides])
 
     def rows(self, body: int) -> VisibilityRows:
-        """Self-visibility of the probes of a body: in memory, on disk, or traced."""
+        """Self-visibility of the probes of a body: in memory, on disk, or traced.
+
+        Backs of open bodies have rows once :meth:`_trace_backs` has filled them: few images show the inside of a scan.
+        """
         if body not in self._rows:
             self._rows[body] = self._cached_by_mesh(body, "rows", lambda: self._find_rows(body))
         return self._rows[body]
 
-    def _announce(self, bodies: tuple[int, ...]) -> None:
+    def _find_rows(self, body: int) -> VisibilityRows:
+        fronts = self._find_side_rows(body, _FRONT)
+        if not self._merged_scene.is_two_sided[body]:
+            return fronts
+        count, device = self._row_count(body), self._merged_scene.device
+        rows = VisibilityRows(*(zeros((count, array.shape[1]), array.dtype, device) for array in fronts))
+        rows.fill(fronts, 0)
+        return rows
+
+    def _trace_backs(self, body: int) -> None:
+        """Fill the rows of the backs of an open body, if they are not filled yet."""
+
+        def fill() -> bool:
+            self._announce((body,), _BACK)
+            self.rows(body).fill(self._find_side_rows(body, _BACK), len(self.probes(body).positions))
+            return True
+
+        if self._merged_scene.is_two_sided[body]:
+            self._cached_by_mesh(body, "backs", fill)
+
+    def _trace_seen_backs(self, body: int, weights: ProbeWeights) -> None:
+        """Fill the rows of backs if receivers lie on some, or if that cannot be read without waiting."""
+        if self._merged_scene.is_two_sided[body] and weights.rows.size:
+            count = len(self.probes(body).positions)
+            if not is_readable(self._merged_scene.device) or weights.rows.numpy().max() >= count:
+                self._trace_backs(body)
+
+    def _announce(self, bodies: tuple[int, ...], side: int = _FRONT) -> None:
         """Say how long rows that are to be traced take, if that is long."""
         seconds, point_count, untraced_paths = 0.0, 0, set()
         for body in bodies:
-            is_known = self._merged_scene.is_flat[body] or body in self._rows
-            if not is_known and (path := self._rows_path(body)) not in untraced_paths and not path.exists():
+            is_known = self._merged_scene.is_flat[body] or (side == _FRONT and body in self._rows)
+            if not is_known and (path := self._rows_path(body, side)) not in untraced_paths and not path.exists():
                 untraced_paths.add(path)
-                point_count += self._row_count(body)
-                faces = self._merged_scene.scene.bodies[body].mesh.surface.faces
-                seconds += trace_seconds(self._row_count(body), len(faces))
+                points, faces = len(self.probes(body).positions), self._merged_scene.scene.bodies[body].mesh.faces
+                point_count += points
+                rays = points * ray_count(self._row_count(body))
+                seconds += trace_seconds(rays, len(faces), are_backs=side == _BACK)
         of_bodies = "a body on itself" if len(untraced_paths) == 1 else f"{len(untraced_paths)} bodies on themselves"
         announce(
             f"tracing the shadow of {of_bodies}, from {point_count:,} points,",
@@ -312,23 +348,18 @@ class SelfVisibility:
             shows=self._progress,
         )
 
-    def _rows_path(self, body: int) -> Path:
-        """Where the cache has the rows of a body."""
+    def _rows_path(self, body: int, side: int) -> Path:
+        """Where the cache has the rows of a side of a body."""
         mesh, probes = self._merged_scene.scene.bodies[body].mesh, self.probes(body)
         count = ray_count(self._row_count(body))
-        numbers = [
-            VERSION,
-            count,
-            len(probes.positions),
-            bool(self._merged_scene.is_two_sided[body]),
-            len(mesh.positions),
-        ]
+        numbers = [VERSION, count, len(probes.positions), side, len(mesh.positions)]
         key = hashlib.sha256(json.dumps(numbers).encode())
         key.update(probes.positions.tobytes())
         key.update(np.asarray(mesh.surface.faces, np.int32).tobytes())
         return cache_path("self_shadows", key.hexdigest())
 
-    def _find_rows(self, body: int) -> VisibilityRows:
+    def _find_side_rows(self, body: int, side: int) -> VisibilityRows:
+        """Rows of the fronts, or backs, of a body's probes: on disk, or traced."""
         mesh, device = self._merged_scene.scene.bodies[body].mesh, self._merged_scene.device
         probes, faces = self.probes(body), mesh.surface.faces
         count = ray_count(self._row_count(body))
@@ -341,7 +372,7 @@ class SelfVisibility:
 
         def read(stored: Mapping[str, np.ndarray]) -> VisibilityRows:
             for name, dtype, width in (("bits", np.uint32, count // 32), ("cells", np.uint8, count // RAYS_PER_CELL)):
-                check.shape(name, stored[name].shape, (self._row_count(body), width))
+                check.shape(name, stored[name].shape, (len(probes.positions), width))
                 if stored[name].dtype != dtype:
                     raise ValueError(f"{name}: got {stored[name].dtype}, expected {np.dtype(dtype)}")
             return VisibilityRows(*(wp.array(stored[name], device=device) for name in VisibilityRows._fields))
@@ -349,8 +380,7 @@ class SelfVisibility:
         def trace(unfinished: Unfinished) -> VisibilityRows:
             points = from_numpy(probes.positions[: len(mesh.positions)], dtype=wp.vec3, device=device)
             whole = wp.Mesh(points, from_numpy(faces.ravel(), dtype=wp.int32, device=device))
-            normals = self._normals(body)
-            places = np.tile(probes.ray_origins, (len(normals) // len(probes.normals), 1))
+            places, normals = probes.ray_origins, side * probes.normals
 
             def keep(bits: wp.array) -> None:
                 done = f"{len(bits):,} of {len(places):,} points"
@@ -366,11 +396,11 @@ class SelfVisibility:
                     store_bits=keep,
                     progress=self._progress,
                 )
-                is_buried = find_buried(whole, places, normals, len(probes.positions), rows)
+                is_buried = find_buried(whole, places, normals, rows, are_backs=side == _BACK)
                 return rows.dilated(find_dilation(probes, is_buried))
 
         return load_or_compute(
-            self._rows_path(body),
+            self._rows_path(body, side),
             read,
             trace,
             lambda rows: {name: array.numpy() for name, array in rows._asdict().items()},

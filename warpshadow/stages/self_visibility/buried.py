@@ -23,7 +23,7 @@ def _find_buried(
     mesh: wp.uint64,
     points: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),
-    probe_count: int,
+    are_backs: bool,
     directions: wp.array(dtype=wp.vec3),
     bits: wp.array2d(dtype=wp.uint32),
     # out
@@ -42,7 +42,7 @@ def _find_buried(
         if wp.dot(normals[row], directions[ray]) > 0.0:
             hit = first_hit(mesh, points[row], normals[row], directions[ray])
             if hit.face >= 0:
-                if hit.is_back == (row >= probe_count):
+                if hit.is_back == are_backs:
                     front_hits += 1
                 else:
                     back_hits += 1
@@ -56,17 +56,18 @@ def find_buried(
     mesh: wp.Mesh,
     points: np.ndarray,
     normals: np.ndarray,
-    probe_count: int | None = None,
     rows: VisibilityRows | None = None,
+    *,
+    are_backs: bool = False,
 ) -> np.ndarray:
     """Find the rows of probes that no ray escapes from, and whose rays mostly meet faces on their other side.
 
     Args:
         mesh: The mesh, in the frame of the points.
-        points: Probes, and their backs if they have any, [row, 3].
+        points: Probes, [row, 3].
         normals: Unit normals [row, 3].
-        probe_count: Number of probes; by default all are.
         rows: Their traced visibility; None traces rays instead.
+        are_backs: Whether they are backs of probes.
     Returns:
         Bool of shape [row].
     """
@@ -75,14 +76,7 @@ def find_buried(
         wp.array(values, dtype=wp.vec3, device=device) for values in (points, normals, fibonacci(_RAYS))
     )
     is_buried = empty(len(points), dtype=wp.bool, device=device)
-    inputs = [
-        mesh.id,
-        point_array,
-        normal_array,
-        probe_count or len(points),
-        directions,
-        None if rows is None else rows.bits,
-    ]
+    inputs = [mesh.id, point_array, normal_array, are_backs, directions, None if rows is None else rows.bits]
     launch(_find_buried, len(points), inputs=inputs, outputs=[is_buried])
     return is_buried.numpy()
 
@@ -91,22 +85,19 @@ def find_dilation(probes: VisibilityProbes, is_buried: np.ndarray) -> np.ndarray
     """Find the row from which each row copies visibility: itself, or its nearest unburied neighbor along edges.
 
     Args:
-        is_buried: Bool of shape [row]: the probes, and their backs if they have any.
+        is_buried: Bool of shape [row]: the probes, or their backs.
     Returns:
         Numbers of rows, int of shape [row]. A buried row from which no way leads to another kind keeps its own.
     """
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import dijkstra
 
-    dilation, probe_count = np.arange(len(is_buried)), len(probes.positions)
+    dilation, probe_count = np.arange(len(is_buried)), len(is_buried)
+    if not is_buried.any() or is_buried.all():
+        return dilation
     edge_ends = np.unique(np.sort(probes.edges, axis=1), axis=0)
     lengths = np.linalg.norm(probes.positions[edge_ends[:, 0]] - probes.positions[edge_ends[:, 1]], axis=1)
     graph = csr_matrix((np.maximum(lengths, 1e-12), edge_ends.T), (probe_count, probe_count))  # 0 is no edge
-    for first_row in range(0, len(is_buried), probe_count):
-        is_buried_probe = is_buried[first_row : first_row + probe_count]
-        if is_buried_probe.any() and not is_buried_probe.all():
-            open_probes = np.flatnonzero(~is_buried_probe)
-            *_, nearest_open = dijkstra(graph, False, open_probes, return_predecessors=True, min_only=True)
-            is_dilated = is_buried_probe & (nearest_open >= 0)
-            dilation[first_row : first_row + probe_count][is_dilated] = first_row + nearest_open[is_dilated]
-    return dilation
+    open_probes = np.flatnonzero(~is_buried)
+    *_, nearest_open = dijkstra(graph, False, open_probes, return_predecessors=True, min_only=True)
+    return np.where(is_buried & (nearest_open >= 0), nearest_open, dilation)
