@@ -1,8 +1,8 @@
-"""Convex hulls of bodies whose pieces stand side by side, such as slats, books on a shelf, bricks of a wall.
+"""Convex hulls of bodies whose pieces stand side by side, such as slats, pickets, crates, and keys of a keyboard.
 
 Seen from anywhere, such pieces together cover about min(Σ_pieces h, h_hull) of a disc of directions, of which each
-covers h and their convex hull h_hull: exactly so much if they do not overlap, or leave no gap. Trunks of a wood, of
-which many are behind each other, do not. Rays tell.
+covers h and their convex hull h_hull: exactly so much if none is before another, or if they leave no gap. Trunks of a
+wood, of which many are behind each other, cover less. Rays tell.
 """
 
 from collections.abc import Sequence
