@@ -64,19 +64,20 @@ def _hull(points: np.ndarray, corners: np.ndarray) -> ConvexPart:
 def _is_close(points: np.ndarray, parts: Sequence[ConvexPart]) -> bool:
     """Whether min(Σ h, h_hull) is near the share that the parts cover, by rays in discs; the last part is the hull."""
     rng, corners = np.random.default_rng(0), points[parts[-1].corners]
-    away = rng.normal(size=(_RECEIVERS, 1, 3))
-    away *= rng.uniform(*_DISTANCES, away.shape[:1])[:, None, None] / np.linalg.norm(away, axis=-1, keepdims=True)
-    receivers = (corners.min(axis=0) + corners.max(axis=0)) / 2 + np.ptp(corners, axis=0).max() * away
+    distances = np.ptp(corners, axis=0).max() * rng.uniform(*_DISTANCES, (_RECEIVERS, 1, 1))
+    outward = rng.normal(size=(_RECEIVERS, 1, 3))
+    outward *= distances / np.linalg.norm(outward, axis=-1, keepdims=True)
+    receivers = (corners.min(axis=0) + corners.max(axis=0)) / 2 + outward
     axes = rng.choice(corners, (_RECEIVERS, _DISCS, 3)).mean(axis=2) - receivers  # towards points within the hull
     axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
-    offsets = rng.normal(size=(_RECEIVERS, _DISCS, _RAYS, 3))
-    offsets -= (offsets * axes[:, :, None]).sum(axis=-1, keepdims=True) * axes[:, :, None]
+    ray_offsets = rng.normal(size=(_RECEIVERS, _DISCS, _RAYS, 3))
+    ray_offsets -= (ray_offsets * axes[:, :, None]).sum(axis=-1, keepdims=True) * axes[:, :, None]
     lengths = _RADIUS * np.sqrt((np.arange(_RAYS) + 0.5) / _RAYS)
-    rays = axes[:, :, None] + lengths[:, None] * offsets / np.linalg.norm(offsets, axis=-1, keepdims=True)
+    rays = axes[:, :, None] + lengths[:, None] * ray_offsets / np.linalg.norm(ray_offsets, axis=-1, keepdims=True)
     hits = np.stack([_are_hit(points[part.corners[part.faces]], receivers[:, :, None], rays) for part in parts])
     shares, covered = hits.mean(axis=-1), hits[:-1].any(axis=0).mean(axis=-1)  # [part, receiver, disc]
     bounds, independent = np.minimum(shares[:-1].sum(axis=0), shares[-1]), 1 - np.prod(1 - shares[:-1], axis=0)
-    error, error_if_independent = (np.abs(each - covered)[bounds > 0].mean() for each in (bounds, independent))
+    error, error_if_independent = (np.abs(shares - covered)[bounds > 0].mean() for shares in (bounds, independent))
     return bool(error <= min(MAX_EXCESS, error_if_independent / 2))
 
 

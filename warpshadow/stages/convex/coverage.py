@@ -127,8 +127,8 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
             direction = inputs.cells.directions[q]
             by_parts = task.coverage[q]
             by_hull = find_coverage(inputs.parts, silhouette, direction, inputs.radius)
-            reaches = is_positive(find_reach(task, bound, direction))  # not where the receiver lies on the hull
-            is_hull = wp.cw_mul(reaches, is_positive(by_parts.share - by_hull.share))
+            is_reached = is_positive(find_reach(task, bound, direction))  # not where the receiver lies on the hull
+            is_hull = wp.cw_mul(is_reached, is_positive(by_parts.share - by_hull.share))
             is_parts = Lane(1.0) - is_hull
             task.is_hull[q] = is_hull
             task.coverage[q] = Coverages(
