@@ -388,6 +388,34 @@ def test_gradients_of_coverage_by_convex_parts_are_exact(double, check, device):
     check(lambda p, v: cover(p, blockers.place(v), blockers, directions), *given)
 
 
+def test_gradients_of_coverage_by_compounds_are_exact(double, check, device):
+    """Slats, which receivers see beside and behind each other, and a tetrahedron; the hull covers some cells."""
+    module, find = double("stages.convex.convex_blockers"), double("maths.convex").find_convex_parts
+    cover = double("stages.convex.coverage").part_coverage
+    directions = double("maths.directions").fibonacci(32)
+    slat = np.array([[x, y, z] for x in (-1.0, 1) for y in (-0.1, 0.1) for z in (-0.3, 0.3)])
+    sides = np.int32([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]])
+    sides = np.concatenate([sides, np.int32([[0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])])
+    slats = np.concatenate([slat + [0.05 * k, 0.31 * k, 0.02 * k] for k in range(3)])
+    parts = find(slats, np.concatenate([sides + 8 * k for k in range(3)]))
+    hull = double("maths.hull").find_hull(slats, parts)
+    bodies = [module.ConvexBody(parts, 0, True, hull), module.ConvexBody(find(VERTICES, FACES), 24)]
+    blockers = module.ConvexBlockers.from_bodies(bodies, 28, device=device)
+    positions = np.concatenate([slats, 0.5 * VERTICES + [1.3, 0.2, 0.1]])[None]
+    points = np.array([[[0.3, 1.5, 0.8], [-0.6, -0.8, -0.7], [1.9, 0.9, 0.9]]])
+    arrays = put(points, wp.vec3d, device), put(positions, wp.vec3d, device)
+
+    def cover_points(points, positions, some=blockers):
+        return cover(points, some.place(positions), some, directions)
+
+    one_piece = module.ConvexBody([part._replace(piece=0) for part in parts], 0)
+    unbounded = module.ConvexBlockers.from_bodies([one_piece, bodies[1]], 28, device=device)
+    shares, sums = cover_points(*arrays).numpy()[..., 0], cover_points(*arrays, unbounded).numpy()[..., 0]
+    assert ((shares > 0) & (shares < 1)).mean() > 0.15
+    assert ((shares > 0) & (shares < 1) & (shares < sums - 0.01)).sum() > 3
+    check(cover_points, (wp.vec3d, points), (wp.vec3d, positions))
+
+
 def test_gradients_of_transmittance_past_parts_to_samples_are_exact(double, check, device):
     """Two walls of a tube of four panels, past whose edges and seams receivers see a lamp, and a tetrahedron."""
     module, find = double("stages.convex.convex_blockers"), double("maths.convex").find_convex_parts

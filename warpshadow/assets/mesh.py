@@ -21,6 +21,7 @@ from warpshadow.assets.color import linear_to_srgb
 from warpshadow.check import AnyPath
 from warpshadow.maths.adjacency import area_normals
 from warpshadow.maths.convex import ConvexPart, find_convex_parts, is_convex
+from warpshadow.maths.hull import find_hull
 from warpshadow.maths.plane import plane_normal
 
 
@@ -172,6 +173,11 @@ class Mesh:
     def convex_parts(self) -> list[ConvexPart]:
         """Its convex solids and panels of cloth; empty if other faces remain."""
         return find_convex_parts(self.positions, self.surface.faces) or []
+
+    @functools.cached_property
+    def hull_of_parts(self) -> ConvexPart | None:
+        """The convex hull of its convex solids, if these stand side by side: see :mod:`.maths.hull`."""
+        return find_hull(self.positions, self.convex_parts)
 
     @functools.cached_property
     def area(self) -> float:

@@ -9,6 +9,7 @@ from scipy.spatial import ConvexHull
 
 from warpshadow.maths.convex import find_convex_parts
 from warpshadow.maths.directions import cell_radius, fibonacci
+from warpshadow.maths.hull import find_hull
 from warpshadow.stages.convex.convex_blockers import ConvexBlockers, ConvexBody
 from warpshadow.stages.convex.coverage import part_coverage
 
@@ -177,6 +178,72 @@ def test_pieces_of_a_body_are_blockers_of_their_own(device):
     for point, found in zip(points, got, strict=True):
         expected = twin(point, DIRECTIONS, cell_radius(32), [[0], [1], [2]])
         np.testing.assert_allclose(found[:, 0], expected[:, 0], rtol=0, atol=RAYS)
+
+
+SLATS = [trimesh.creation.box((1.6, 0.25, 0.06)).apply_translation([0, y, 0]) for y in (-0.3, 0, 0.3)]
+BLIND = trimesh.util.concatenate(SLATS)
+BEFORE_BLIND = np.array([[0.2, 0.1, 0.8], [0.9, -0.5, -0.6], [0.2, 1.2, 0.2], [0.3, 0, 0.02]])
+"""From the third point slats stand behind each other, and the last is in the middle one."""
+
+
+def compound(device, vertices=BLIND.vertices, mesh=BLIND):
+    """Slats of one body with their hull, and a board."""
+    parts = find_convex_parts(mesh.vertices, mesh.faces)
+    (board,) = find_convex_parts(BOARD.vertices, BOARD.faces)
+    bodies = [ConvexBody(parts, 0, True, find_hull(mesh.vertices, parts)), ConvexBody([board], len(vertices))]
+    some = ConvexBlockers.from_bodies(bodies, len(vertices) + 8, device=device)
+    positions = np.concatenate([vertices, BOARD.vertices + [1.3, 0.2, 0]])
+    return some.place(wp.array(positions[None], dtype=wp.vec3, device=device)), some
+
+
+def twin_of_compound(point, directions, radius, across=200):
+    """By :func:`twin`: of the parts together and the hull the one that covers less of each cell, and the board."""
+    slats = [twin(point, directions, radius, [[0]], across, [slat.vertices]) for slat in SLATS]
+    of_parts, of_hull = np.sum(slats, axis=0), twin(point, directions, radius, [[0]], across, [BLIND.vertices])
+    of_board = twin(point, directions, radius, [[0]], across, [BOARD.vertices + [1.3, 0.2, 0]])
+    smaller = np.where(of_parts[:, :1] > of_hull[:, :1], of_hull, of_parts)
+    cells = zip(smaller, of_board, strict=True)
+    return np.array([twins.joint_coverage([a[0], b[0]], [a[1:], b[1:]]) for a, b in cells]), of_parts, of_hull
+
+
+@pytest.mark.parametrize("number", range(len(BEFORE_BLIND)))
+def test_a_compound_covers_no_more_than_its_hull(number, device):
+    point = BEFORE_BLIND[number]
+    expected, of_parts, of_hull = twin_of_compound(point, DIRECTIONS, cell_radius(32))
+    points = wp.array(point[None, None], dtype=wp.vec3, device=device)
+    found = part_coverage(points, *compound(device), DIRECTIONS).numpy()[0, 0]
+    np.testing.assert_allclose(found[:, 0], expected[:, 0], rtol=0, atol=2 * RAYS)
+    is_open = expected[:, 0] < 1
+    np.testing.assert_allclose(found[is_open], expected[is_open], rtol=0, atol=2 * RAYS)
+    if number == 2:
+        assert (of_parts - of_hull)[:, 0].max() > 0.1
+
+
+def test_strips_that_touch_cover_as_much_as_the_panel_they_make(device):
+    strips = [trimesh.creation.box((1.6, 0.1, 0.02)).apply_translation([0, 0.1 * k, 0]) for k in range(12)]
+    panel = trimesh.creation.box((1.6, 1.2, 0.02)).apply_translation([0, 0.55, 0])
+    found = []
+    for mesh in (trimesh.util.concatenate(strips), panel):
+        parts = find_convex_parts(mesh.vertices, mesh.faces)
+        body = ConvexBody(parts, 0, True, find_hull(mesh.vertices, parts))
+        some = ConvexBlockers.from_bodies([body], len(mesh.vertices), device=device)
+        placed = some.place(wp.array(mesh.vertices[None], dtype=wp.vec3, device=device))
+        points = wp.array([[(0.3, 0.2, 0.5), (-0.9, 1.4, -0.3), (0.2, -0.4, 2.0)]], dtype=wp.vec3, device=device)
+        found.append(part_coverage(points, placed, some, DIRECTIONS).numpy())
+    assert ((found[1][..., 0] > 0.1) & (found[1][..., 0] < 0.9)).sum() > 10
+    np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-4)
+
+
+def test_receivers_on_a_compound_see_its_other_parts(device):
+    """On the lowest slat, in the plane of the hull's side."""
+    placed, some = compound(device)
+    options = {"horizon_normals": wp.array([[(0, 1, 0)]], dtype=wp.vec3, device=device), "skip": 1}
+    point = wp.array([[(0.1, -0.175, 0.03)]], dtype=wp.vec3, device=device)
+    found = part_coverage(point, placed, some, DIRECTIONS, on_surface=True, **options).numpy()[0, 0, :, 0]
+    above = twin(np.array([0.1, -0.175, 0.03]), DIRECTIONS, cell_radius(32), [[0]], vertices=[SLATS[1].vertices])[:, 0]
+    is_alone = (DIRECTIONS[:, 1] > 0) & (above > 0.1)
+    assert is_alone.sum() > 3
+    assert (found[is_alone] > above[is_alone] - RAYS).all()
 
 
 SLAB, POST = trimesh.creation.box((2, 0.2, 1)), trimesh.creation.box((0.3, 1, 0.4))

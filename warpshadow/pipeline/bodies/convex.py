@@ -70,8 +70,15 @@ class SceneConvexParts:
         key = bodies, blocking_bodies
         if key not in self._blockers:
             starts, device = self._merged_scene.first_vertex, self._merged_scene.device
+            scene_bodies = self._merged_scene.scene.bodies
             chosen = [
-                ConvexBody(self.parts[number], int(starts[number]), number in blocking_bodies) for number in bodies
+                ConvexBody(
+                    self.parts[number],
+                    int(starts[number]),
+                    number in blocking_bodies,
+                    scene_bodies[number].mesh.hull_of_parts,
+                )
+                for number in bodies
             ]
             self._blockers[key] = ConvexBlockers.from_bodies(chosen, int(starts[-1]), device=device)
         return self._blockers[key]

@@ -25,6 +25,7 @@ class ConvexBody(NamedTuple):
     parts: Sequence[ConvexPart]
     first_vertex: int  # offset of its vertices among the vertices of all bodies
     blocks: bool = True  # whether it casts shadows
+    hull: ConvexPart | None = None  # of its parts, if these are a compound: see :mod:`.convex.coverage`
 
 
 UNSEEN = wp.constant(1.0e30)
@@ -38,6 +39,8 @@ class ConvexArrays:
     bodies: wp.array(dtype=wp.int32)  # of each piece
     blocks: wp.array(dtype=wp.int32)  # whether a piece casts shadows
     first_part: wp.array(dtype=wp.int32)  # of each piece, and the end of the last
+    first_piece: wp.array(dtype=wp.int32)  # of each compound, and the end of the last
+    hulls: wp.array(dtype=wp.int32)  # the part that is the hull of each compound, none of the piece's; −1 for none
     signs: wp.array(dtype=wp.float32)  # of the coverage of each part: −1 for seams, which are a piece's last
     gaps: wp.array(dtype=wp.float32)  # height above each part up to which receivers of its body lie, over its radius
     first_corner: wp.array(dtype=wp.int32)  # of each part, and the end of the last
@@ -59,7 +62,8 @@ class ConvexBlockers:
     @staticmethod
     def from_bodies(bodies: Sequence[ConvexBody], vertex_count: int, *, device: wp.DeviceLike) -> ConvexBlockers:
         """Prepare bodies, among bodies that have so many vertices together."""
-        parts = [part for body in bodies for part in body.parts]
+        hulls = [body.hull for body in bodies if body.hull is not None]
+        parts = [*(part for body in bodies for part in body.parts), *hulls]
         starts = {name: _starts([len(getattr(part, name)) for part in parts]) for name in ("corners", "faces", "edges")}
         faces = [part.faces + first for part, first in zip(parts, starts["corners"], strict=False)]
         shifted_edges = [
@@ -68,10 +72,16 @@ class ConvexBlockers:
         arrays = ConvexArrays()
         pieces = [(number, part.piece) for number, body in enumerate(bodies) for part in body.parts]
         counts = {piece: len(list(group)) for piece, group in itertools.groupby(pieces)}
+        compounds = [(body, 0 if bodies[body].hull is not None else piece) for body, piece in counts]
+        piece_counts = {compound: len(list(group)) for compound, group in itertools.groupby(compounds)}
+        hull_numbers = iter(range(len(parts) - len(hulls), len(parts)))
+        hull_of_each = [-1 if bodies[body].hull is None else next(hull_numbers) for body, _ in piece_counts]
         arrays.bodies = wp.array([body for body, _ in counts], dtype=wp.int32, device=device)
         blocks = [int(bodies[body].blocks) for body, _ in counts]
         arrays.blocks = wp.array(blocks, dtype=wp.int32, device=device)
         arrays.first_part = wp.array(_starts(list(counts.values())), dtype=wp.int32, device=device)
+        arrays.first_piece = wp.array(_starts(list(piece_counts.values())), dtype=wp.int32, device=device)
+        arrays.hulls = wp.array(hull_of_each, dtype=wp.int32, device=device)
         signs = [-1.0 if part.is_seam else 1.0 for part in parts]
         arrays.signs = wp.array(signs, dtype=wp.float32, device=device)
         arrays.gaps = wp.array([part.gap for part in parts], dtype=wp.float32, device=device)
@@ -80,7 +90,9 @@ class ConvexBlockers:
         arrays.first_edge = wp.array(starts["edges"], dtype=wp.int32, device=device)
         arrays.faces = wp.array(np.concatenate(faces), dtype=wp.vec3i, device=device)
         arrays.edges = wp.array(np.concatenate(shifted_edges), dtype=wp.vec4i, device=device)
-        vertices = np.concatenate([body.first_vertex + part.corners for body in bodies for part in body.parts])
+        of_parts = [body.first_vertex + part.corners for body in bodies for part in body.parts]
+        of_hulls = [body.first_vertex + body.hull.corners for body in bodies if body.hull is not None]
+        vertices = np.concatenate([*of_parts, *of_hulls])
         return ConvexBlockers(
             len(bodies),
             max(len(part.edges) for part in parts),

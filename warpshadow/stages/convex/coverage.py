@@ -1,10 +1,18 @@
 """Coverage of cells by convex blockers, such as boxes and rods.
 
-Edges are exact, and so are thin parts: spheres bulge out of them. Each piece of a body covers h_q = Σ_parts h, with the
+Edges are exact, and so are thin parts: spheres bulge out of them. The parts of a body cover h_q = Σ_parts h, with the
 moment Σ_parts μ, of cell q: h and μ are the coverage by the silhouette of a convex part
 (:mod:`warpshadow.stages.cell_coverage`), the edges between a face that a receiver sees and one that it does not. Parts
 of one piece cover different parts of a cell, but for the seams of prisms into which it is cut, which both cover where
 seen at a slant: these are taken off. :mod:`warpshadow.stages.joint_coverage` tells how pieces relate.
+
+Pieces that stand side by side, such as slats, are a compound [Coumans 2003, Bullet: compound shapes] if their body has
+a hull (:mod:`warpshadow.maths.hull`). Their shares add up to no more than their convex hull covers,
+
+    h_q = min(Σ_parts h, h_hull)
+
+with the moment of the smaller. If the pieces were blockers of their own, 14 strips that touch would let 9% of a
+window's light through, and a room behind a blind would be 24% off instead of 6%.
 """
 
 import functools
@@ -38,11 +46,12 @@ _PART_COST = 200.0  # mean time of a part of a receiver [ns]
 
 
 class _PartFunctions(NamedTuple):
-    """Kernel functions on the parts of a piece."""
+    """Kernel functions on the parts of a compound, which is a single piece if it has no hull."""
 
     prepare_block: wp.Function
-    cover_by_piece: wp.Function
-    cover_by_all_pieces: wp.Function
+    is_blocking: wp.Function
+    cover_by_compound: wp.Function
+    cover_by_all: wp.Function
 
 
 @functools.cache
@@ -63,6 +72,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         worker: int,
         inputs: PartInputs,
         coverage: wp.array2d(dtype=Coverages),
+        is_hull: wp.array2d(dtype=Lane),
         covered: wp.array2d(dtype=wp.int32),
         sums: wp.array2d(dtype=SumsOfBlockers),
         chord_sums: wp.array2d(dtype=Lane),
@@ -83,6 +93,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
             task.normals = load(inputs.horizon_normals[batch], block)
         task.lift = Lane(1.0) - is_positive(dot(task.normals, task.normals))
         task.coverage = coverage[slot]
+        task.is_hull = is_hull[slot]
         task.covered = covered[slot]
         task.sums = sums[slot]
         task.silhouette.points = task.points
@@ -98,13 +109,43 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         return task
 
     @wp.func
-    def cover_by_piece(inputs: PartInputs, piece: int, task: PartsTask):
-        """Coverage by a piece of cells that no other covers wholly; returns how many it covers, and lists them."""
+    def is_blocking(inputs: PartInputs, compound: int):
+        """Whether a compound blocks light of the receivers."""
+        piece = inputs.parts.first_piece[compound]
+        return inputs.parts.bodies[piece] != inputs.skip and inputs.parts.blocks[piece] == 1
+
+    @wp.func
+    def bound_by_hull(inputs: PartInputs, hull: int, task: PartsTask, covered_count: int):
+        """Where the hull of a compound covers less of a cell than its parts together, it is the hull that covers."""
+        bound = find_bound(inputs, hull, task)
+        silhouette = task.silhouette
+        count, is_solid = find_silhouette(inputs.parts, hull, silhouette)
+        silhouette.count = count
+        silhouette.is_solid = is_solid
+        for k in range(covered_count):
+            q = task.covered[k]
+            direction = inputs.cells.directions[q]
+            by_parts = task.coverage[q]
+            by_hull = find_coverage(inputs.parts, silhouette, direction, inputs.radius)
+            is_reached = is_positive(find_reach(task, bound, direction))  # not where the receiver lies on the hull
+            is_hull = wp.cw_mul(is_reached, is_positive(by_parts.share - by_hull.share))
+            is_parts = Lane(1.0) - is_hull
+            task.is_hull[q] = is_hull
+            task.coverage[q] = Coverages(
+                wp.cw_mul(is_parts, by_parts.share) + wp.cw_mul(is_hull, by_hull.share),
+                add(scale(is_parts, by_parts.moment), scale(is_hull, by_hull.moment)),
+            )
+
+    @wp.func
+    def cover_by_compound(inputs: PartInputs, compound: int, task: PartsTask):
+        """Coverage by a compound of cells that no other covers wholly; returns how many it covers, and lists them."""
         parts, cells, radius = inputs.parts, inputs.cells, inputs.radius
+        first = parts.first_part[parts.first_piece[compound]]
+        end = parts.first_part[parts.first_piece[compound + 1]]
         covered_count = int(0)
         silhouette = task.silhouette
-        max_sum = wp.where(parts.signs[parts.first_part[piece + 1] - 1] < 0.0, 1.0e30, 1.0)  # seams take off
-        for part in range(parts.first_part[piece], parts.first_part[piece + 1]):
+        max_sum = wp.where(parts.signs[end - 1] < 0.0, 1.0e30, 1.0)  # seams take off
+        for part in range(first, end):
             bound = find_bound(inputs, part, task)
             sign = parts.signs[part]
             if is_any_above(bound.rise, 0.0):
@@ -135,20 +176,22 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
                                         covered_share + wp.cw_mul(factor, by_part.share),
                                         add(task.coverage[q].moment, scale(factor, by_part.moment)),
                                     )
+        if covered_count > 0 and parts.hulls[compound] >= 0:
+            bound_by_hull(inputs, parts.hulls[compound], task, covered_count)
         return covered_count
 
     @wp.func
-    def cover_by_all_pieces(inputs: PartInputs, task: PartsTask):
-        """Store sums over all pieces for each cell."""
-        for piece in range(inputs.parts.first_part.shape[0] - 1):
-            if inputs.parts.bodies[piece] != inputs.skip and inputs.parts.blocks[piece] == 1:
-                covered_count = cover_by_piece(inputs, piece, task)
+    def cover_by_all(inputs: PartInputs, task: PartsTask):
+        """Store sums over all compounds for each cell."""
+        for compound in range(inputs.parts.hulls.shape[0]):
+            if is_blocking(inputs, compound):
+                covered_count = cover_by_compound(inputs, compound, task)
                 for k in range(covered_count):
                     q = task.covered[k]
                     task.sums[q] = with_blocker(task.sums[q], task.coverage[q])
                     task.coverage[q] = Coverages()
 
-    return _PartFunctions(prepare_block, cover_by_piece, cover_by_all_pieces)
+    return _PartFunctions(prepare_block, is_blocking, cover_by_compound, cover_by_all)
 
 
 @functools.cache
@@ -156,7 +199,7 @@ def _make_cover(lanes: int) -> wp.Kernel:
     Lane, Coverages, SumsOfBlockers = lane_type(lanes), coverage_type(lanes), sums_type(lanes)
     fn, functions, joint = make_lane_functions(lanes), _make_part_functions(lanes), make_joint_functions(lanes)
     is_any_above, joint_coverage, store_columns = fn.is_any_above, joint.joint_coverage, joint.store_columns
-    prepare_block, _, cover_by_all_pieces = functions
+    prepare_block, _, _, cover_by_all = functions
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def cover_cells(
@@ -166,6 +209,7 @@ def _make_cover(lanes: int) -> wp.Kernel:
         inputs: PartInputs,
         # scratch
         coverage: wp.array2d(dtype=Coverages),
+        is_hull: wp.array2d(dtype=Lane),
         covered: wp.array2d(dtype=wp.int32),
         sums: wp.array2d(dtype=SumsOfBlockers),
         chord_sums: wp.array2d(dtype=Lane),
@@ -176,8 +220,8 @@ def _make_cover(lanes: int) -> wp.Kernel:
     ):
         """A thread owns a block of receivers."""
         row = first_row + wp.tid()
-        task = prepare_block(row, worker, inputs, coverage, covered, sums, chord_sums, edges, numbers)
-        cover_by_all_pieces(inputs, task)
+        task = prepare_block(row, worker, inputs, coverage, is_hull, covered, sums, chord_sums, edges, numbers)
+        cover_by_all(inputs, task)
         for q in range(task.coverage.shape[0]):
             if is_any_above(task.sums[q].total, 0.0):
                 task.coverage[q] = joint_coverage(task.sums[q])
@@ -195,7 +239,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
     add, add_vectors = fn.add, fn.add_vectors
     joint_coverage_adjoint, blocker_adjoint = joint.joint_coverage_adjoint, joint.blocker_adjoint
     load_columns = joint.load_columns
-    prepare_block, cover_by_piece, cover_by_all_pieces = functions
+    prepare_block, is_blocking, cover_by_compound, cover_by_all = functions
     find_bound, _, find_reach = make_bound_functions(lanes)
     find_silhouette, _find_coverage, coverage_adjoint, silhouette_adjoint = make_silhouette_functions(lanes)
     ADJOINT_STRIDE = wp.constant(ADJOINT_LANES)
@@ -217,6 +261,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
         adj_result: wp.array3d(dtype=wp.vec4),
         # scratch
         coverage: wp.array2d(dtype=Coverages),
+        is_hull: wp.array2d(dtype=Lane),
         covered: wp.array2d(dtype=wp.int32),
         sums: wp.array2d(dtype=SumsOfBlockers),
         chord_sums: wp.array2d(dtype=Lane),
@@ -231,10 +276,10 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
     ):
         """A thread owns a block of receivers; cells that are covered wholly have no gradient."""
         row = first_row + wp.tid()
-        task = prepare_block(row, worker, inputs, coverage, covered, sums, chord_sums, edges, numbers)
+        task = prepare_block(row, worker, inputs, coverage, is_hull, covered, sums, chord_sums, edges, numbers)
         task.silhouette.adj_edges = adj_edges[task.slot]
         parts, radius = inputs.parts, inputs.radius
-        cover_by_all_pieces(inputs, task)
+        cover_by_all(inputs, task)
         load_columns(adj_result[task.batch], task.block, task.coverage)
         for q in range(task.coverage.shape[0]):
             adj_sums[task.slot, q] = SumsOfBlockers()
@@ -243,10 +288,10 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
             task.coverage[q] = Coverages()
         silhouette = task.silhouette
         adj_point = Vectors()
-        for piece in range(parts.first_part.shape[0] - 1):
+        for compound in range(parts.hulls.shape[0]):
             covered_count = int(0)
-            if parts.bodies[piece] != inputs.skip and parts.blocks[piece] == 1:
-                covered_count = cover_by_piece(inputs, piece, task)
+            if is_blocking(inputs, compound):
+                covered_count = cover_by_compound(inputs, compound, task)
             affected_count = int(0)
             for k in range(covered_count):
                 q = task.covered[k]
@@ -261,7 +306,11 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
                     task.covered[affected_count] = q
                     affected_count += 1
             if affected_count > 0:
-                for part in range(parts.first_part[piece], parts.first_part[piece + 1]):
+                first = parts.first_part[parts.first_piece[compound]]
+                end = parts.first_part[parts.first_piece[compound + 1]]
+                hull = parts.hulls[compound]
+                for number in range(first, end + wp.where(hull < 0, 0, 1)):
+                    part = wp.where(number < end, number, hull)
                     bound = find_bound(inputs, part, task)
                     is_found = bool(False)
                     for k in range(affected_count):
@@ -277,6 +326,9 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
                                 for i in range(ADJOINT_STRIDE * count):
                                     silhouette.adj_edges[i] = Lane(0.0)
                             factor = parts.signs[part] * is_positive(reach)
+                            if hull >= 0:
+                                by_hull = task.is_hull[q]
+                                factor = wp.cw_mul(factor, wp.where(number < end, Lane(1.0) - by_hull, by_hull))
                             adj_cell = Coverages(
                                 wp.cw_mul(factor, task.coverage[q].share), scale(factor, task.coverage[q].moment)
                             )
@@ -345,7 +397,7 @@ def part_coverage(
         variables=[points],
         shared=[placed_parts.corners],
         scratch=[
-            *(Scratch(by_cell, dtype) for dtype in (coverage_type(lanes), wp.int32, sums)),
+            *(Scratch(by_cell, dtype) for dtype in (coverage_type(lanes), Lane, wp.int32, sums)),
             Scratch((SUM_LANES,), Lane),
             Scratch((EDGE_LANES * edge_count,), Lane),
             Scratch((2, edge_count), wp.int32),

@@ -53,9 +53,10 @@ def task_type(lanes: int) -> Any:
         points: Vectors
         normals: Vectors
         lift: Lane  # 1 where there is no horizon, else 0
-        coverage: wp.array(dtype=Coverages)  # [direction] by the parts of a piece, 0 between pieces
+        coverage: wp.array(dtype=Coverages)  # [direction] by a compound, 0 between compounds
+        is_hull: wp.array(dtype=Lane)  # [direction] 1 where its hull covers, else 0; not set without one
         covered: wp.array(dtype=wp.int32)  # numbers of the cells in which that is not 0
-        sums: wp.array(dtype=SumsOfBlockers)  # [direction] over pieces
+        sums: wp.array(dtype=SumsOfBlockers)  # [direction] over compounds
         silhouette: Silhouette
 
     return PartsTask
