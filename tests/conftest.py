@@ -1,5 +1,6 @@
 """What the tests share: devices, golden values, and the optional data of real meshes and maps."""
 
+import gc
 import importlib
 import math
 import pkgutil
@@ -32,6 +33,16 @@ def pytest_generate_tests(metafunc):
         asked = metafunc.config.getoption("devices")
         aliases = asked.split(",") if asked else [device.alias for device in wp.get_devices()]
         metafunc.parametrize("device", aliases)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Look for no garbage among the two million objects of modules and tests: they last as long as the session."""
+    gc.disable()
+    result = yield
+    gc.freeze()
+    gc.enable()
+    return result
 
 
 def pytest_collection_modifyitems(config, items):
