@@ -14,6 +14,8 @@ import warp as wp
 
 import warpshadow
 from warpshadow.device import cuda_graph, lanes, parallel, progress
+from warpshadow.pipeline.bodies import self_visibility
+from warpshadow.stages.self_visibility import trace
 
 warpshadow.quiet()
 
@@ -102,6 +104,16 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(count)
+
+
+@pytest.fixture
+def few_rays(monkeypatch):
+    """Find shadows of bodies on themselves by 512 rays a point: tests that compare two images need no finer ones.
+
+    Where none are cached, as in CI, they take most of the time of such a test.
+    """
+    for module in (self_visibility, trace):
+        monkeypatch.setattr(module, "RAYS", 512)
 
 
 @pytest.fixture
