@@ -1,5 +1,6 @@
 """What the tests share: devices, golden values, and the optional data of real meshes and maps."""
 
+import gc
 import importlib
 import math
 import pkgutil
@@ -13,6 +14,8 @@ import warp as wp
 
 import warpshadow
 from warpshadow.device import cuda_graph, lanes, parallel, progress
+from warpshadow.pipeline.bodies import self_visibility
+from warpshadow.stages.self_visibility import trace
 
 warpshadow.quiet()
 
@@ -32,6 +35,16 @@ def pytest_generate_tests(metafunc):
         asked = metafunc.config.getoption("devices")
         aliases = asked.split(",") if asked else [device.alias for device in wp.get_devices()]
         metafunc.parametrize("device", aliases)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Look for no garbage among the two million objects of modules and tests: they last as long as the session."""
+    gc.disable()
+    result = yield
+    gc.freeze()
+    gc.enable()
+    return result
 
 
 def pytest_collection_modifyitems(config, items):
@@ -91,6 +104,16 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(count)
+
+
+@pytest.fixture
+def few_rays(monkeypatch):
+    """Find shadows of bodies on themselves by 512 rays a point: tests that compare two images need no finer ones.
+
+    Where none are cached, as in CI, they take most of the time of such a test.
+    """
+    for module in (self_visibility, trace):
+        monkeypatch.setattr(module, "RAYS", 512)
 
 
 @pytest.fixture

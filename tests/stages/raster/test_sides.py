@@ -34,7 +34,7 @@ SMOOTH = 1e-2
 # Differences of points of faces that are as large as samples, against mean slopes over samples; measured 2.0e-2.
 SLOPES = 4e-2
 
-pytestmark = pytest.mark.usefixtures("one_thread", "poisoned_outputs")
+pytestmark = pytest.mark.usefixtures("one_thread", "poisoned_outputs", "few_rays")
 
 
 # ---------------------------------------------------------------------------------------------- scenes
