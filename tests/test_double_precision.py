@@ -747,6 +747,21 @@ def test_gradients_of_transmittance_of_lobes_are_exact(double, device, check, gl
     check(lambda *arguments: module.interpolate_transmittance(*arguments, cells), *arguments)
 
 
+def test_gradients_of_weights_above_faces_are_exact(double, device, check):
+    """Of samples above their face, on its edge of light, and below it; on either side."""
+    module = double("stages.gloss.face_horizon")
+    fragments = double("stages.raster.rasterization").Fragments(put(np.int32([[0, 0]]), wp.int32, device), None)
+    faces, normals = put(np.int32([[0, 1, 2]]), wp.vec3i, device), put([[[0, 0, 1], [0, 0, -1]]], wp.vec3d, device)
+    corners = np.array([[[-1, -1, 0], [1, -1, 0.01], [0, 1, -0.01]]])
+    heights = np.array([[[0.5, -0.02, -0.06, -0.5], [-0.5, 0.03, 0.07, 0.5]]])
+    directions = unit(np.concatenate([random(0, 1, 2, 4, 2), 1.5 * heights[..., None]], axis=3))
+
+    def weigh(positions, directions, filters):
+        return module.weigh_by_faces(fragments, faces, positions, normals, directions, filters)
+
+    check(weigh, (wp.vec3d, corners), (wp.vec3d, directions), (wp.vec3d, random(1, 1, 2, 4, 3)))
+
+
 @pytest.mark.parametrize("quantity", [0, 1])
 def test_gradients_of_suns_in_lobes_are_exact(quantity, double, device, check, glossy):
     """One in the middle of a lobe, one that is wide beside it, one at a slant."""
