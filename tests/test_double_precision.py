@@ -798,7 +798,7 @@ def test_gradients_of_sums_of_lobes_are_exact(quantity, double, device, check):
 
 
 @pytest.mark.parametrize("quantity", ["radiance", "filters"])
-def test_gradients_of_the_light_of_metals_are_exact(quantity, double, device, check):
+def test_gradients_of_the_light_of_mirrored_bodies_are_exact(quantity, double, device, check):
     """Of samples that meet a face, whose mirrored ray meets the sky, a body, or leaves below it, and that meet none."""
     module = double("stages.gloss.mirrored")
     hits = np.int32([[[0, 0, -1], [1, -1, 1]]]), np.abs(random(0, 1, 2, 3, 3)), unit(random(1, 1, 2, 3, 3))
@@ -809,15 +809,15 @@ def test_gradients_of_the_light_of_metals_are_exact(quantity, double, device, ch
     )
     faces = put(np.int32([[0, 1, 2], [1, 3, 2]]), wp.vec3i, device)
 
-    def mix(roughness, directions, filters, albedo, metallic, mean, share):
+    def mix(roughness, directions, filters, albedo, metallic, mean, share, radiosity):
         mirrored = module.mirror(hits, faces, roughness, directions, filters)
-        light = mirrored.directions, mean, share
+        light = mirrored.directions, mean, share, radiosity
         mixed = module.mix_mirrored(hits, faces, albedo, metallic, mirrored.filters, *light)
         return mixed if quantity == "radiance" else mirrored.filters
 
     scalars = [(wp.float64, 0.5 + 0.2 * np.tanh(random(seed, 1, 4))) for seed in (2, 3)]
     samples = (wp.vec3d, unit(random(4, 1, 2, 3, 3))), (wp.vec3d, 0.2 + np.abs(random(5, 1, 2, 3, 3)))
-    blockers = (wp.vec3d, random(7, 1, 2, 3)), (wp.float64, random(8, 1, 2, 3))
+    blockers = (wp.vec3d, random(7, 1, 2, 3)), (wp.float64, random(8, 1, 2, 3)), (wp.vec3d, random(9, 1, 4, 3))
     check(mix, scalars[0], *samples, (wp.vec3d, random(6, 1, 4, 3)), scalars[1], *blockers)
 
 

@@ -44,7 +44,7 @@ _CELL_ROWS = 64  # rows of the map of free light in cells: each pixel has the li
 
 
 def mix_gloss(
-    method: Method, lobes: LitLobes, diffuse: Node, materials: Materials, blocked: Node | None
+    method: Method, lobes: LitLobes, diffuse: Node, materials: Materials, blocked: Node | None, radiosity: Node | None
 ) -> tuple[Node, Node]:
     """Mix mirrored light with diffuse light, of all receivers of the view.
 
@@ -53,7 +53,7 @@ def mix_gloss(
         lobes: The receivers on bodies that shine, and their light.
         diffuse: Node of the view's shading.
         materials: Of the bodies.
-        blocked: As of :meth:`.LightTransport.blocked_radiance`.
+        blocked, radiosity: As of :meth:`.LightTransport.blocked_radiance` and :meth:`.LightTransport.radiosity`.
     Returns:
         Nodes of the light that colored and that white surfaces reflect, vec3 of shape [batch, receiver].
     """
@@ -76,11 +76,13 @@ def mix_gloss(
     radiance = _look_up(method, points, "prefiltered light", light, texels, directions, filters, starts)
     transmittance = visibility.transmittance(lobes, directions)
     mirrored: Node | None = None
-    if blocked is not None and (mirrors := method.mirrored_bodies.mirrors(materials)):
+    mirrored_bodies = method.mirrored_bodies
+    shown = mirrored_bodies.shown(mirrored_bodies.mirrors(materials), materials, radiosity)
+    if blocked is not None and shown:
         texels = texels if light.is_free else visibility.prefiltered(points, light, with_suns=True)
         look_up = functools.partial(_look_up, method, points, "", light, texels)
-        mirrored = method.mirrored_bodies.radiance(
-            mirrors, points, light, materials, samples, transmittance, blocked, look_up
+        mirrored = mirrored_bodies.radiance(
+            shown, points, light, materials, samples, transmittance, blocked, look_up, radiosity
         )
     lobe_light = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, mirrored, items=item_text)
     suns = visibility.suns(points, light)
