@@ -775,6 +775,21 @@ def test_gradients_of_transmittance_of_lobes_are_exact(double, device, check, gl
     check(lambda *arguments: module.interpolate_transmittance(*arguments, cells), *arguments)
 
 
+def test_gradients_of_weights_above_faces_are_exact(double, device, check):
+    """Of samples above their face, on its edge of light, and below it; on either side."""
+    module = double("stages.gloss.face_horizon")
+    fragments = double("stages.raster.rasterization").Fragments(put(np.int32([[0, 0]]), wp.int32, device), None)
+    faces, normals = put(np.int32([[0, 1, 2]]), wp.vec3i, device), put([[[0, 0, 1], [0, 0, -1]]], wp.vec3d, device)
+    corners = np.array([[[-1, -1, 0], [1, -1, 0.01], [0, 1, -0.01]]])
+    heights = np.array([[[0.5, -0.02, -0.06, -0.5], [-0.5, 0.03, 0.07, 0.5]]])
+    directions = unit(np.concatenate([random(0, 1, 2, 4, 2), 1.5 * heights[..., None]], axis=3))
+
+    def weigh(positions, directions, filters):
+        return module.weigh_by_faces(fragments, faces, positions, normals, directions, filters)
+
+    check(weigh, (wp.vec3d, corners), (wp.vec3d, directions), (wp.vec3d, random(1, 1, 2, 4, 3)))
+
+
 @pytest.mark.parametrize("quantity", [0, 1])
 def test_gradients_of_suns_in_lobes_are_exact(quantity, double, device, check, glossy):
     """One in the middle of a lobe, one that is wide beside it, one at a slant."""
@@ -811,7 +826,7 @@ def test_gradients_of_sums_of_lobes_are_exact(quantity, double, device, check):
 
 
 @pytest.mark.parametrize("quantity", ["radiance", "filters"])
-def test_gradients_of_the_light_of_metals_are_exact(quantity, double, device, check):
+def test_gradients_of_the_light_of_mirrored_bodies_are_exact(quantity, double, device, check):
     """Of samples that meet a face, whose mirrored ray meets the sky, a body, or leaves below it, and that meet none."""
     module = double("stages.gloss.mirrored")
     hits = np.int32([[[0, 0, -1], [1, -1, 1]]]), np.abs(random(0, 1, 2, 3, 3)), unit(random(1, 1, 2, 3, 3))
@@ -822,15 +837,15 @@ def test_gradients_of_the_light_of_metals_are_exact(quantity, double, device, ch
     )
     faces = put(np.int32([[0, 1, 2], [1, 3, 2]]), wp.vec3i, device)
 
-    def mix(roughness, directions, filters, albedo, metallic, mean, share):
+    def mix(roughness, directions, filters, albedo, metallic, mean, share, radiosity):
         mirrored = module.mirror(hits, faces, roughness, directions, filters)
-        light = mirrored.directions, mean, share
+        light = mirrored.directions, mean, share, radiosity
         mixed = module.mix_mirrored(hits, faces, albedo, metallic, mirrored.filters, *light)
         return mixed if quantity == "radiance" else mirrored.filters
 
     scalars = [(wp.float64, 0.5 + 0.2 * np.tanh(random(seed, 1, 4))) for seed in (2, 3)]
     samples = (wp.vec3d, unit(random(4, 1, 2, 3, 3))), (wp.vec3d, 0.2 + np.abs(random(5, 1, 2, 3, 3)))
-    blockers = (wp.vec3d, random(7, 1, 2, 3)), (wp.float64, random(8, 1, 2, 3))
+    blockers = (wp.vec3d, random(7, 1, 2, 3)), (wp.float64, random(8, 1, 2, 3)), (wp.vec3d, random(9, 1, 4, 3))
     check(mix, scalars[0], *samples, (wp.vec3d, random(6, 1, 4, 3)), scalars[1], *blockers)
 
 

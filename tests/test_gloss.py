@@ -369,6 +369,29 @@ def metal_scene(*bodies):
     return ws.Scene(bodies, SKY, camera, supersampling=2, bounces=1, visibility=ws.Visibility(directions=64))
 
 
+@pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render()])
+def test_a_metal_mirrors_a_red_and_a_blue_ball_each_in_its_place(render):
+    """By the mean radiance of blockers red would be less than twice blue."""
+    colors, positions = ((0.8, 0.1, 0.1), (0.1, 0.1, 0.8)), ((-0.5, 0, 1), (0.5, 0, 1))
+    balls = [
+        ws.Body(ws.icosphere(0.45, 3), color, translation=position)
+        for color, position in zip(colors, positions, strict=True)
+    ]
+    wall = ws.Body(ws.plane(4.0), (1, 1, 1), rotation=(90, 0, 0), roughness=0.1, metallic=1.0)
+    camera = ws.Camera.look_at((-0.5, 2, 2.5), (-0.5, 0.571, 0), fov_y=4, size=(8, 8))
+    image = render(ws.Scene([*balls, wall], ws.EnvironmentMap.constant(1.0), camera, bounces=1))[..., :3]
+    red, _, blue = image.mean(axis=(0, 1))
+    assert red > 5 * blue
+
+
+def test_gradients_to_the_color_of_a_body_that_a_metal_mirrors_agree_with_differences():
+    ball = ws.Body(METAL.mesh, (0.7, 0.5, 0.4), blockers=METAL.blockers, translation=(0.55, 0.5, 0))
+    renderer = TorchRenderer(metal_scene(METALS[0], ball, GROUND), progress=False)
+    value, image = torch.tensor([[0.7, 0.5, 0.4]]), weights()[:24, :24]
+    gradient, difference = twins.slopes(lambda color: (renderer(albedo={1: color}).double() * image).sum(), value, 3e-3)
+    assert gradient == pytest.approx(difference, rel=METALS_SMOOTH["albedo"])
+
+
 def test_one_convex_metal_takes_no_rays_for_metals_that_it_mirrors():
     torus = trimesh.creation.torus(0.4, 0.15)
     ring = dataclasses.replace(METALS[0], mesh=ws.Mesh(torus.vertices, torus.faces), blockers=16)

@@ -26,11 +26,12 @@ import functools
 from typing import TYPE_CHECKING
 
 from warpshadow.pipeline.bodies.reflectance import Materials
-from warpshadow.pipeline.node import Node
+from warpshadow.pipeline.node import Node, field_of
 from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.light.sums import add_light
+from warpshadow.stages.sparse import multiply
 
 if TYPE_CHECKING:  # they are imported where light bounces, or bodies shine
     from warpshadow.pipeline.bounces.moving_bounces import MovingBounces
@@ -154,6 +155,26 @@ class LightTransport:
         bounced, openness = self.shading_without_emitters(*arguments), self._openness(*arguments)
         selected_openness = None if openness is None else lobes.points.select(openness)
         return self.method.lobes.blocked_radiance(lobes, lobes.points.select(bounced), selected_openness)
+
+    def radiosity(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node | None:
+        """Radiosity of the sides of faces, where patches of known light or of moving bodies have it.
+
+        Returns:
+            Node of vec3 of shape [batch, 2 · face]; None where light does not bounce, or along paths, or where it is
+            free among static patches, of which only transfer is known.
+        """
+        senders = self._patches.senders(materials) if self.method.merged_scene.scene.bounces else None
+        if senders is None or not senders.bodies:
+            return None
+        solver = self.bounce_solver(points, light, materials)
+        if solver is BounceSolver.MOVING:
+            of_patches = field_of(self._moving_bounces.radiosity(points, light, materials), "radiosity")
+        elif solver is BounceSolver.STATIC and not light.is_free:
+            at_patch_samples = self._lit_patch_samples(points, light, materials)
+            of_patches = self._static_bounces.radiosity(at_patch_samples, points, materials)
+        else:
+            return None
+        return Node("", lambda radiosity: multiply(senders.mean_over_faces, radiosity), of_patches)
 
     def _openness(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node | None:
         """Part of the hemispheres of points that no blocker takes, vec3 of shape [view, receiver].

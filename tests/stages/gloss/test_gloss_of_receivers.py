@@ -7,6 +7,7 @@ import warp as wp
 
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.gloss import lobes, prefilter, reflection, transmittance
+from warpshadow.stages.gloss.face_horizon import weigh_by_faces
 from warpshadow.stages.gloss.normal_spread import NormalSpread, find_normal_spread
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.textures import numbers
@@ -145,6 +146,24 @@ def test_normals_vary_over_a_pixel_as_they_do_between_pixels(device, tilt, is_sm
         expected = change / (2 * step) * 2 / size * slant / np.hypot(slant, 0.1)
         found = result.numpy()[0, 0]
         assert min(np.abs(found - expected).max(), np.abs(found + expected).max()) < 3e-3 * np.abs(expected).max()
+
+
+def test_samples_that_leave_below_their_face_have_no_weight(device):
+    """On the front and the back of a face, and on none."""
+    rng = np.random.default_rng(3)
+    corners = np.array([[-1.0, -0.8, 0.1], [1.1, -0.7, -0.4], [0.1, 0.9, 0.3]])
+    face_normal = twins.unit(np.cross(corners[1] - corners[0], corners[2] - corners[0]))
+    side = np.array([1.0, -1.0, 1.0])[:, None]
+    normals = twins.unit(side * face_normal + 0.5 * rng.normal(size=3))
+    directions, filters = twins.unit(side[:, None] * face_normal + rng.normal(size=(3, 32, 3))), rng.random((3, 32, 3))
+    fragments = Fragments(wp.array([[0, 0, -1]], dtype=wp.int32, device=device), wp.empty((1, 3), wp.vec3, device))
+    faces = wp.array([[0, 1, 2]], dtype=wp.vec3i, device=device)
+    inputs = arrays(device, corners[None], normals[None], directions[None], filters[None])
+    heights = np.clip(1 + side * (directions @ face_normal) / 0.1, 0, 1)
+    heights[2] = 1
+    expected = filters * np.stack([heights**2 * (3 - 2 * heights)] * 2 + [np.ones_like(heights)], axis=-1)
+    assert ((heights > 0) & (heights < 1)).any() and (heights[:2] == 0).any()
+    assert np.abs(weigh_by_faces(fragments, faces, *inputs).numpy()[0] - expected).max() < 20 * FLOAT32
 
 
 @pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])

@@ -1,4 +1,4 @@
-"""Metals that lobes meet, against NumPy: a mirror and a wall that face each other, and receivers between them."""
+"""Bodies that lobes meet, against NumPy: a mirror and a wall that face each other, and receivers between them."""
 
 import numpy as np
 import twins
@@ -26,12 +26,12 @@ def put(values, dtype, device):
     return wp.array(np.asarray(values), dtype=dtype, device=device)
 
 
-def hits_of(device, transmittance=0.0, points=POINTS, normals=UP, directions=DIRECTIONS):
+def hits_of(device, transmittance=0.0, points=POINTS, normals=UP, directions=DIRECTIONS, is_shown=(1, 1, 0, 0)):
     mesh = wp.Mesh(put(POSITIONS, wp.vec3, device), put(FACES.ravel(), wp.int32, device))
     arrays = [put(values, wp.vec3, device) for values in (NORMALS, points, normals, directions)]
     through = wp.full((2, 3), transmittance, dtype=wp.float32, device=device)
-    is_mirror, faces = put([1, 1, 0, 0], wp.int32, device), put(FACES, wp.vec3i, device)
-    return lobe_hits.trace_hits(mesh, is_mirror, faces, *arrays, through), faces
+    is_shown, faces = put(is_shown, wp.int32, device), put([*FACES, *FACES], wp.vec3i, device)
+    return lobe_hits.trace_hits(mesh, is_shown, faces, *arrays, through), faces
 
 
 def expected_hits():
@@ -66,11 +66,11 @@ def test_nothing_is_traced_towards_open_sky(device):
     assert (hits.face_ids.numpy() == -1).all()
 
 
-def mixed(device, hits, faces, *arrays):
+def mixed(device, hits, faces, *arrays, radiosity=None):
     """M of all samples, of a light that is the mirrored direction and its blur."""
     roughness, directions, filters, albedo, metallic, mean, through = arrays
     towards = mirrored.mirror(hits, faces, roughness, directions, filters)
-    light = towards.directions, mean, through
+    light = towards.directions, mean, through, radiosity
     return mirrored.mix_mirrored(hits, faces, albedo, metallic, towards.filters, *light), towards
 
 
@@ -98,7 +98,7 @@ def test_metals_send_the_light_that_they_mirror_in_their_color(device):
     radiance, towards = mixed(device, batched(hits), faces, *arrays)
     meets, normals, is_open, expected_towards, _ = expected_hits()
     roughness, _, filters, albedo, metallic, mean, through = (array.numpy()[0] for array in arrays)
-    weights, corners = hits.barycentrics.numpy()[meets], FACES[hits.face_ids.numpy()[meets]]
+    weights, corners = hits.barycentrics.numpy()[meets], faces.numpy()[hits.face_ids.numpy()[meets]]
     rough, color, share = (
         np.einsum("hc,hc...->h...", weights, values[corners]) for values in (roughness, albedo, metallic)
     )
@@ -112,6 +112,26 @@ def test_metals_send_the_light_that_they_mirror_in_their_color(device):
     expected = np.zeros((2, 3, 3))
     expected[meets] = ((1 - through[meets]) * share)[:, None] * (fresnel * seen - of_receivers[meets])
     np.testing.assert_allclose(radiance.numpy()[0], expected, atol=10 * FLOAT32)
+
+
+def test_bodies_that_are_no_metals_send_the_radiosity_of_the_side_that_samples_meet(device):
+    """Of the wall, from its front and, for receivers behind it, from its back."""
+    rng, sent = np.random.default_rng(1), []
+    radiosity = rng.uniform(size=(1, 8, 3))
+    arrays = inputs_of(device)
+    arrays[4].zero_()
+    for x, forwards in ((0.0, -1.0), (-3.0, 1.0)):
+        directions = np.broadcast_to([[[forwards, 0.1, 0.2], [forwards, 0.05, 0.1], [0, 1, 0]]], (2, 3, 3))
+        points = POINTS + np.float32([x, 0, 0])
+        hits, faces = hits_of(device, points=points, directions=twins.unit(directions.copy()), is_shown=(0, 0, 1, 1))
+        radiance, _ = mixed(device, batched(hits), faces, *arrays, radiosity=put(radiosity, wp.vec3, device))
+        numbers = hits.face_ids.numpy()
+        assert (numbers[:, :2] >= 2).all() and (numbers[:, 2] == -1).all()
+        sent.append(numbers[:, :2] // 4)
+        mean, through = arrays[5].numpy()[0], arrays[6].numpy()[0]
+        expected = (1 - through[..., None]) * (radiosity[0][numbers] - mean[:, None])
+        np.testing.assert_allclose(radiance.numpy()[0, :, :2], expected[:, :2], atol=10 * FLOAT32)
+    assert (sent[0] != sent[1]).all()
 
 
 def test_no_light_comes_from_below_the_face_that_a_ray_leaves(device):

@@ -240,24 +240,47 @@ class MovingBounces:
         if not senders.bodies:
             direct = ShadingNode(method, points, projected_light, light)
             return Node("bounces", identity, direct, idle="every body is black")
-        proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
-        make_visibility = functools.partial(
-            TransferNode if light.is_free else ShadingNode,
-            method,
-            projected_light=method.visibility_basis(points, light),
-            light=light,
-            result_of=functools.partial(_portion_for_bounces, method),
-            join=identity,
-        )
-        free_light = projected_light if light.is_free else None
+        make_visibility = self._visibility_maker(points, light)
         key, is_cached = light.visibility_key, light.is_free or materials is not points.materials
         visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
-        of_patch_samples = points.cached(
-            "of patch samples", (key, senders), lambda: self._patch_samples(make_visibility, proxies, points)
-        )
-        radiosity = self._radiosity(of_patch_samples, free_light, proxies, materials)
+        radiosity = self.radiosity(points, light, materials)
         item_text = functools.partial(receiver_text, points.weak_reference)
+        free_light = projected_light if light.is_free else None
         return BouncedShading(visibility, free_light, item_text, radiosity, self._gatherer(senders, item_text))
+
+    def radiosity(self, points: ShadingContext, light: LightInput, materials: Materials) -> Radiosity:
+        """Node of the radiosity of the patches around points, if a body sends light."""
+        return points.cached("radiosity", (light, materials), lambda: self._make_radiosity(points, light, materials))
+
+    def _make_radiosity(self, points: ShadingContext, light: LightInput, materials: Materials) -> Radiosity:
+        method, senders = self._method, self._patches.senders(materials)
+        proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
+        patch_samples = points.cached(
+            "of patch samples",
+            (light.visibility_key, senders),
+            lambda: self._patch_samples(self._visibility_maker(points, light), proxies, points),
+        )
+        why_not = "light bounces once" if self._count == 1 else ""
+        arguments = f"{len(senders.sides):,} patch samples", OF_PATCH_SAMPLES
+        lit: Node = patch_samples.visibility
+        if light.is_free:
+            lit = DirectLightNode(patch_samples.visibility, method.projected_light(points, light), *arguments)
+        if materials.emission:
+            lit = Node("", _add_emitted, lit, method.light_of_emitters(patch_samples.points, materials))
+        albedo = self._patches.albedo(materials, senders.bodies)
+        gatherer = self._gatherer(senders, *arguments, why_not, only_others=True)
+        return Radiosity(self._count, proxies, self._self_form_factors, gatherer, lit, albedo, patch_samples)
+
+    def _visibility_maker(self, points: ShadingContext, light: LightInput) -> Callable[..., TransferNode]:
+        """Makes nodes of visibility in free light, or of light if it is known."""
+        return functools.partial(
+            TransferNode if light.is_free else ShadingNode,
+            self._method,
+            projected_light=self._method.visibility_basis(points, light),
+            light=light,
+            result_of=functools.partial(_portion_for_bounces, self._method),
+            join=identity,
+        )
 
     def _patch_samples(
         self, make_visibility: Callable[..., TransferNode], proxies: Proxies, points: ShadingContext
@@ -275,21 +298,6 @@ class MovingBounces:
         placed_proxies = Node("", project, lit_samples.receivers_node, visibility, spheres, frames)
         weights = Node("", functools.partial(_patch_weights, senders), visibility)
         return PatchSampleNodes(lit_samples, visibility, frames, placed_proxies, weights)
-
-    def _radiosity(
-        self, patch_samples: PatchSampleNodes, free_light: Node | None, proxies: Proxies, materials: Materials
-    ) -> Radiosity:
-        """Radiosity of the patches, given the light at their patch samples."""
-        senders, why_not = proxies.senders, "light bounces once" if self._count == 1 else ""
-        arguments = f"{len(senders.sides):,} patch samples", OF_PATCH_SAMPLES
-        lit: Node = patch_samples.visibility
-        if free_light is not None:
-            lit = DirectLightNode(patch_samples.visibility, free_light, *arguments)
-        if materials.emission:
-            lit = Node("", _add_emitted, lit, self._method.light_of_emitters(patch_samples.points, materials))
-        albedo = self._patches.albedo(materials, senders.bodies)
-        gatherer = self._gatherer(senders, *arguments, why_not, only_others=True)
-        return Radiosity(self._count, proxies, self._self_form_factors, gatherer, lit, albedo, patch_samples)
 
     def _gatherer(self, senders: Senders, *arguments: Any, **options: Any) -> BounceGatherer:
         return BounceGatherer(self._method.visibility, senders, self._self_form_factors, *arguments, **options)

@@ -254,6 +254,25 @@ class Senders:
             positions, normals, self.merged_scene.faces, self.sides, self.barycentrics, self._bodies
         )
 
+    @functools.cached_property
+    def mean_over_faces(self) -> SparseMatrix:
+        """Weights of patches in the sides of faces, by area: [2 · face, patch]; 0 of sides that send nothing."""
+        from scipy.sparse import coo_matrix, diags
+
+        merged_scene, entries = self.merged_scene, []
+        for number, first, item in zip(self.bodies, self.first[:-1], self.patches, strict=True):
+            mesh = merged_scene.scene.bodies[number].mesh
+            a, b, c = item.pieces.positions(mesh.positions, mesh.surface.faces).swapaxes(0, 1)
+            areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) + 1e-30
+            for is_back, owners in enumerate(item.patch_of_pieces):
+                sides = item.pieces.faces + merged_scene.first_face[number] + is_back * merged_scene.first_face[-1]
+                entries.append(np.stack([areas, sides, owners + first])[:, owners >= 0])
+        areas, sides, owners = np.concatenate(entries, axis=1)
+        shape = 2 * int(merged_scene.first_face[-1]), int(self.first[-1])
+        matrix = coo_matrix((areas, (sides.astype(int), owners.astype(int))), shape).tocsr()
+        sums = np.maximum(matrix.sum(axis=1).A1, 1e-30)
+        return SparseMatrix.from_matrix(diags(1 / sums) @ matrix, device=merged_scene.device)
+
     def nearest_open_patches(self, is_open: np.ndarray) -> np.ndarray:
         """The patch whose light each has: itself if it is open, else the nearest open one of its body, if any is.
 

@@ -114,16 +114,35 @@ class StaticBounces:
         """Shading with bounces, given the direct light on patches, vec3 of shape [batch, patch]."""
         senders = self._patches.senders(materials)
 
-        def bounce(direct: wp.array, albedo: wp.array, patch_light: wp.array, factors: StaticFormFactors) -> wp.array:
-            return factors.to_receivers(direct, self._light_at_cache_points(albedo, patch_light, factors, senders))
+        def bounce(direct: wp.array, radiosity: wp.array, factors: StaticFormFactors) -> wp.array:
+            return factors.to_receivers(direct, multiply(factors.to_cache_points, radiosity))
 
-        albedo = self._patches.albedo(materials, senders.bodies)
-        return Node("bounces", bounce, direct, albedo, patch_light, factors, items=self._item_text(points, senders))
+        radiosity = self._radiosity_node(patch_light, factors, points, materials)
+        return Node("bounces", bounce, direct, radiosity, factors, items=self._item_text(points, senders))
+
+    def radiosity(self, at_patch_samples: Node, points: ShadingContext, materials: Materials) -> Node:
+        """Node of the radiosity of patches in the light of :meth:`add_bounces`, vec3 of shape [batch, patch]."""
+        factors = self._factors(points, materials, self._patches.senders(materials), at_patch_samples)
+        make = functools.partial(Node, "", _light_on_patches, at_patch_samples, factors)
+        light = points.cached("light of patches", at_patch_samples, make)
+        return self._radiosity_node(light, factors, points, materials)
+
+    def _radiosity_node(self, patch_light: Node, factors: Node, points: ShadingContext, materials: Materials) -> Node:
+        senders = self._patches.senders(materials)
+        find = functools.partial(self._find_radiosity, senders=senders)
+        inputs = self._patches.albedo(materials, senders.bodies), patch_light, factors
+        return points.cached("radiosity", (patch_light, materials), lambda: Node("", find, *inputs))
 
     def _light_at_cache_points(
         self, albedo: wp.array, patch_light: wp.array, factors: StaticFormFactors, senders: Senders
     ) -> wp.array:
         """Bounced light at cache points, vec3 of shape [batch, cache point]. Differentiable: albedo, patch_light."""
+        return multiply(factors.to_cache_points, self._find_radiosity(albedo, patch_light, factors, senders))
+
+    def _find_radiosity(
+        self, albedo: wp.array, patch_light: wp.array, factors: StaticFormFactors, senders: Senders
+    ) -> wp.array:
+        """Radiosity, vec3 of shape [batch, patch]. Differentiable: albedo, patch_light."""
 
         def light_of_others(radiosity: wp.array | None) -> wp.array:
             """Light on patches from the sky and from other bodies."""
@@ -135,7 +154,7 @@ class StaticBounces:
             )
 
         arguments = self._bounces, light_of_others, reflect_all, senders.areas
-        return multiply(factors.to_cache_points, after_bounces(*arguments, self_bounces=SELF_BOUNCES))
+        return after_bounces(*arguments, self_bounces=SELF_BOUNCES)
 
     def openness(self, points: ShadingContext, materials: Materials, at_patch_samples: Node | None) -> Node | None:
         """Part of the hemispheres of points that no blocker takes, by the rays that find the light of blockers.

@@ -23,6 +23,7 @@ from warpshadow.pipeline.shading.lobe_light import LitLobes
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.shading.transfers import change_basis
 from warpshadow.scene.material import GLOSS_ARGUMENTS
+from warpshadow.stages.gloss.face_horizon import weigh_by_faces
 from warpshadow.stages.gloss.lobes import LobeSamples, sample_lobes
 from warpshadow.stages.gloss.normal_spread import NormalSpread, find_normal_spread
 from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
@@ -43,7 +44,7 @@ _CELL_ROWS = 64  # rows of the map of free light in cells: each pixel has the li
 
 
 def mix_gloss(
-    method: Method, lobes: LitLobes, diffuse: Node, materials: Materials, blocked: Node | None
+    method: Method, lobes: LitLobes, diffuse: Node, materials: Materials, blocked: Node | None, radiosity: Node | None
 ) -> tuple[Node, Node]:
     """Mix mirrored light with diffuse light, of all receivers of the view.
 
@@ -52,7 +53,7 @@ def mix_gloss(
         lobes: The receivers on bodies that shine, and their light.
         diffuse: Node of the view's shading.
         materials: Of the bodies.
-        blocked: As of :meth:`.LightTransport.blocked_radiance`.
+        blocked, radiosity: As of :meth:`.LightTransport.blocked_radiance` and :meth:`.LightTransport.radiosity`.
     Returns:
         Nodes of the light that colored and that white surfaces reflect, vec3 of shape [batch, receiver].
     """
@@ -65,7 +66,7 @@ def mix_gloss(
         geometry = points.normals, points.vertices, points.cameras
         find_spread = functools.partial(_find_normal_spread, method)
         spread = Node("", find_spread, points.receivers_node, *geometry, points.fragments)
-        inputs = points.receivers_node, roughness, points.cameras, spread, points.fragments
+        inputs = points.receivers_node, roughness, points.cameras, spread, points.fragments, points.vertices
         return Node("lobes", functools.partial(_sample_lobes, method), *inputs, items=item_text)
 
     samples = points.cached("lobes", materials.roughness, sample)
@@ -75,11 +76,13 @@ def mix_gloss(
     radiance = _look_up(method, points, "prefiltered light", light, texels, directions, filters, starts)
     transmittance = visibility.transmittance(lobes, directions)
     mirrored: Node | None = None
-    if blocked is not None and (mirrors := method.mirrored_bodies.mirrors(materials)):
+    mirrored_bodies = method.mirrored_bodies
+    shown = mirrored_bodies.shown(mirrored_bodies.mirrors(materials), materials, radiosity)
+    if blocked is not None and shown:
         texels = texels if light.is_free else visibility.prefiltered(points, light, with_suns=True)
         look_up = functools.partial(_look_up, method, points, "", light, texels)
-        mirrored = method.mirrored_bodies.radiance(
-            mirrors, points, light, materials, samples, transmittance, blocked, look_up
+        mirrored = mirrored_bodies.radiance(
+            shown, points, light, materials, samples, transmittance, blocked, look_up, radiosity
         )
     lobe_light = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, mirrored, items=item_text)
     suns = visibility.suns(points, light)
@@ -154,14 +157,23 @@ def _find_normal_spread(
 
 
 def _sample_lobes(
-    method: Method, receivers: Receivers, roughness: wp.array, cameras: wp.array, spread: NormalSpread, seen: Fragments
+    method: Method,
+    receivers: Receivers,
+    roughness: wp.array,
+    cameras: wp.array,
+    spread: NormalSpread,
+    seen: Fragments,
+    positions: wp.array,
 ) -> LobeSamples:
     """Samples of the lobes of the receivers. Differentiable: all but seen."""
     places, receivers_across = None, method.lobes.receivers_across
     if receivers_across > 1 and receivers.samples is not None:
         places = places_in_pixels(receivers.samples, seen.face_ids.shape[2], receivers_across)
     arguments = receivers.points, receivers.normals, roughness, cameras, method.lobes.samples_of_receiver
-    return sample_lobes(*arguments, spread, places, receivers_across**2)
+    samples, fragments = sample_lobes(*arguments, spread, places, receivers_across**2), receivers.sample_fragments
+    assert fragments is not None
+    above = fragments, method.merged_scene.side_faces, positions, receivers.normals
+    return samples._replace(filters=weigh_by_faces(*above, samples.directions, samples.filters))
 
 
 def _sample_textures(

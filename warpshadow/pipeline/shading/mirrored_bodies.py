@@ -1,4 +1,4 @@
-"""Mirrored bodies: light that metals add to the mean radiance of blockers, where rays say which ones lobes meet.
+"""Mirrored bodies: light that bodies add to the mean radiance of blockers, where rays say which ones lobes meet.
 
 As bodies and cameras move, the mirrored light changes within a metal's outline in a lobe, and the outline moves; most
 of both cancels. Hits know no outlines, so the first alone would make gradients wrong (of two balls 2.6 times too
@@ -27,7 +27,7 @@ from warpshadow.stages.receivers.find import Receivers
 
 
 class MirroredBodies:
-    """The metals that lobes meet, in a mesh of all bodies that is made once and refitted to each geometry.
+    """The bodies that lobes meet, in a mesh of all bodies that is made once and refitted to each geometry.
 
     Args:
         merged_scene: The bodies.
@@ -48,9 +48,20 @@ class MirroredBodies:
             if materials.may_be_metal(number) and (is_glossy.sum() > 1 or not bodies[number].mesh.is_convex)
         )
 
+    def shown(self, mirrors: tuple[int, ...], materials: Materials, radiosity: Node | None) -> tuple[int, ...]:
+        """Bodies whose own light counts where lobes meet them: mirrors and, beside a metal, others with a radiosity.
+
+        Flat bodies keep the mean radiance of blockers: their faces may be as large as a room.
+        """
+        is_flat, is_glossy = self._merged_scene.is_flat, self._merged_scene.is_glossy
+        metals = {n for n in np.flatnonzero(is_glossy).tolist() if materials.may_be_metal(n)}
+        if radiosity is None or not metals:
+            return mirrors
+        return tuple(sorted({*mirrors, *np.flatnonzero(~is_flat).tolist()} - (metals - {*mirrors})))
+
     def radiance(
         self,
-        mirrors: tuple[int, ...],
+        shown: tuple[int, ...],
         points: ShadingContext,
         light: LightInput,
         materials: Materials,
@@ -58,11 +69,12 @@ class MirroredBodies:
         transmittance: Node,
         mean_radiance: Node,
         look_up: Callable[[Node, Node, Node], Node],
+        radiosity: Node | None,
     ) -> Node:
-        """Node of the radiance that metals add to the mean of blockers, vec3 of shape [batch, receiver, sample].
+        """Node of the radiance that bodies add to the mean of blockers, vec3 of shape [batch, receiver, sample].
 
         Args:
-            mirrors: The metals, of :meth:`mirrors`.
+            shown: The bodies, of :meth:`shown`.
             points: The receivers.
             light: Known or free.
             materials: Of the bodies.
@@ -71,29 +83,30 @@ class MirroredBodies:
             mean_radiance: Node of the mean radiance of each receiver's blockers.
             look_up: Makes the node of light without shadows, of nodes of directions, filters, and where these rays
                 start.
+            radiosity: Node of that of the sides of faces, vec3 of shape [batch, 2 · face]; None for none.
         """
-        faces, filters = self._merged_scene.faces, field_of(samples, "filters")
+        faces, filters = self._merged_scene.side_faces, field_of(samples, "filters")
         directions, transmittance = (
             Node("", without_gradient, node) for node in (field_of(samples, "directions"), transmittance)
         )
 
         def trace() -> Node:
-            find = functools.partial(self._find_hits, mirrors)
+            find = functools.partial(self._find_hits, shown)
             traced = points.vertices, points.normals, points.receivers_node, directions, transmittance
             items = functools.partial(receiver_text, points.weak_reference)
             return Node("hits of lobes", find, *(detached(source) for source in traced), items=items)
 
-        hits = points.cached("hits", (samples, light.visibility_key, mirrors), trace)
+        hits = points.cached("hits", (samples, light.visibility_key, shown), trace)
         roughness, albedo, metallic = (materials.of_vertices(name) for name in ("roughness", "albedo", "metallic"))
         mirrored = Node("", mirror, hits, faces, roughness, directions, filters)
         filters = field_of(mirrored, "filters")
         mirrored_light = look_up(field_of(mirrored, "directions"), filters, field_of(hits, "points"))
-        inputs = faces, albedo, metallic, filters, mirrored_light, mean_radiance, transmittance
-        return Node("light of metals", mix_mirrored, hits, *inputs)
+        inputs = faces, albedo, metallic, filters, mirrored_light, mean_radiance, transmittance, radiosity
+        return Node("light of mirrored bodies", mix_mirrored, hits, *inputs)
 
     def _find_hits(
         self,
-        mirrors: tuple[int, ...],
+        shown: tuple[int, ...],
         positions: wp.array,
         vertex_normals: wp.array,
         receivers: Receivers,
@@ -102,11 +115,11 @@ class MirroredBodies:
     ) -> LobeHits:
         """Trace all instances: arrays of shape [batch, receiver, sample]."""
         merged_scene = self._merged_scene
-        is_mirror = constant(np.isin(merged_scene.body_of_face, mirrors).astype(np.int32), wp.int32, positions.device)
+        is_shown = constant(np.isin(merged_scene.body_of_face, shown).astype(np.int32), wp.int32, positions.device)
         hits = [
             trace_hits(
                 self._refitted(instance_of(positions, instance)),
-                is_mirror,
+                is_shown,
                 merged_scene.faces,
                 instance_of(vertex_normals, instance),
                 instance_of(receivers.points, instance),

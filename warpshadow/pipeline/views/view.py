@@ -260,7 +260,8 @@ class View(ShadingContext):
         points = self.cached("gloss", None, lambda: GlossyPoints(self, *arguments))
         lobes = LitLobes(points, light, self)
         blocked = self.transport.blocked_radiance(lobes, materials)
-        colored, white = mix_gloss(self.method, lobes, shading, materials, blocked)
+        radiosity = self.transport.radiosity(self, light, materials)
+        colored, white = mix_gloss(self.method, lobes, shading, materials, blocked, radiosity)
         reflected = self._radiance(colored, reflectance, materials)
         return self._sum_of(reflected, self._radiance(white, self._white_reflectance))
 

@@ -1,4 +1,4 @@
-"""Hits of lobes: which faces of bodies that shine their samples meet, and whether these see the sky they mirror.
+"""Hits of lobes: which faces of bodies their samples meet, and whether metals among them see the sky they mirror.
 
 Where smooth normals lean away from faces, rays leave below the face that they start on. There is no light from there.
 """
@@ -23,7 +23,7 @@ def _trace_hits(
     worker: int,
     # in
     mesh: wp.uint64,
-    is_mirror: wp.array(dtype=wp.int32),
+    is_shown: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     vertex_normals: wp.array(dtype=wp.vec3),
     points: wp.array(dtype=wp.vec3),
@@ -44,12 +44,14 @@ def _trace_hits(
     face = int(-1)
     point = points[receiver]
     last_ray = int(MEETS_BODY)
+    is_back = bool(False)
     if transmittance[receiver, sample] < 1.0 and wp.dot(direction, normals[receiver]) > 0.0:
         hit = first_hit(mesh, points[receiver], normals[receiver], direction)
         face = hit.face
+        is_back = hit.is_back
         if hit.is_below:
             last_ray = LEAVES_BELOW
-        if is_mirror[wp.max(face, 0)] == 0:
+        if is_shown[wp.max(face, 0)] == 0:
             face = -1
         if face >= 0:
             corners = faces[face]
@@ -71,14 +73,16 @@ def _trace_hits(
             elif escapes(mesh, point, normal, mirrored):
                 last_ray = MEETS_SKY
     last_rays[receiver, sample] = last_ray
+    if face >= 0 and is_back:
+        face += is_shown.shape[0]
     face_ids[receiver, sample] = face
     hit_points[receiver, sample] = point
 
 
 class LobeHits(NamedTuple):
-    """Points of bodies that shine, which samples of lobes meet; arrays of shape [receiver, sample]."""
+    """Points of bodies that samples of lobes meet; arrays of shape [receiver, sample]."""
 
-    face_ids: wp.array  # int32, −1 for a sample that meets no such body: it has no other number
+    face_ids: wp.array  # sides of faces, int32; −1 for a sample that meets no such body: it has no other number
     barycentrics: wp.array  # vec3
     normals: wp.array  # unit normals on the side that is met, vec3
     last_rays: wp.array  # what becomes of the ray that is mirrored, else of the sample: MEETS_SKY or another; int32
@@ -90,7 +94,7 @@ HIT_TYPES = wp.int32, wp.vec3, wp.vec3, wp.int32, wp.vec3  # of the arrays of Lo
 
 def trace_hits(
     mesh: wp.Mesh,
-    is_mirror: wp.array,
+    is_shown: wp.array,
     faces: wp.array,
     vertex_normals: wp.array,
     points: wp.array,
@@ -102,7 +106,7 @@ def trace_hits(
 
     Args:
         mesh: Of all bodies.
-        is_mirror: 1 for faces that shine, int32 of shape [face].
+        is_shown: 1 for faces whose own light counts, int32 of shape [face].
         faces: Vertices of the mesh, vec3i of shape [face].
         vertex_normals: Their unit normals, vec3 of shape [vertex].
         points, normals: Of the receivers, vec3 of shape [receiver].
@@ -113,6 +117,6 @@ def trace_hits(
     """
     shape, device = directions.shape, points.device
     hits = LobeHits(*(empty(shape, dtype=dtype, device=device) for dtype in HIT_TYPES))
-    inputs = [mesh.id, is_mirror, faces, vertex_normals, points, normals, directions, transmittance]
+    inputs = [mesh.id, is_shown, faces, vertex_normals, points, normals, directions, transmittance]
     launch(_trace_hits, shape, inputs=inputs, outputs=[*hits], cost=2 * RAY_COST * shape[1])
     return hits

@@ -1,14 +1,14 @@
-"""Mirrored bodies: a metal that a lobe meets reflects light once more, from where its own normal mirrors.
+"""Mirrored bodies: a body that a lobe meets shows its radiosity, a metal light from where its own normal mirrors.
 
 A sample l of a lobe, of transmittance T, meets a body at a point with normal n, which mirrors l' = l − 2 (n·l) n. To
 the mean radiance R̄ of the receiver's blockers the point adds
 
-    M = (1 − T) m (F L' − R̄),   F = a + (1 − a) (1 − |n·l|)⁵,
+    M = (1 − T) (m F L' + (1 − m) B − R̄),   F = a + (1 − a) (1 − |n·l|)⁵,
 
-m how metallic it is, a its albedo, and L' the radiance from l': R̄ where that ray meets a body, 0 where it leaves below
-the face that it starts on (:mod:`.lobe_hits`), else L, light without shadows, blurred by σ'² = σ² + 2 α²: σ is the blur
-of the sample (:mod:`.lobes`), √2 α that of a whole lobe, seen from above. Where l itself leaves below the receiver's
-face, M = −(1 − T) R̄.
+m how metallic it is, a its albedo, B the radiosity of its side of the face, and L' the radiance from l': R̄ where that
+ray meets a body, 0 where it leaves below the face that it starts on (:mod:`.lobe_hits`), else L, light without shadows,
+blurred by σ'² = σ² + 2 α²: σ is the blur of the sample (:mod:`.lobes`), √2 α that of a whole lobe, seen from above.
+Where l itself leaves below the receiver's face, M = −(1 − T) R̄. Where light bounces along paths, B is R̄.
 """
 
 from typing import NamedTuple
@@ -80,7 +80,7 @@ def mirror(
 
     Args:
         hits: Of :func:`.lobe_hits.trace_hits`, of all instances, [batch, receiver, sample].
-        faces: Vertices of the mesh, vec3i of shape [face].
+        faces: Vertices of the sides of its faces, vec3i of shape [2 · face].
         roughness: Of the vertices, float32 of shape [batch, vertex].
         directions, filters: Of :func:`.lobes.sample_lobes`. Any batch may be 1 and then serves every instance.
 
@@ -116,6 +116,7 @@ def _mix_mirrored(
     light: wp.array3d(dtype=wp.vec3),
     mean_radiance: wp.array2d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
+    radiosity: wp.array2d(dtype=wp.vec3),
     # out
     radiance: wp.array3d(dtype=wp.vec3),
 ):
@@ -141,7 +142,10 @@ def _mix_mirrored(
         if last_ray == LEAVES_BELOW:
             seen = wp.vec3()
         fresnel = color + grazing * (wp.vec3(1.0) - color)
-        result = share * blocked * (wp.cw_mul(fresnel, seen) - mean)
+        diffuse = mean
+        if radiosity:
+            diffuse = radiosity[instance_in(batch, radiosity.shape[0]), face]
+        result = blocked * (share * wp.cw_mul(fresnel, seen) + (1.0 - share) * diffuse - mean)
     radiance[batch, receiver, sample] = result
 
 
@@ -154,8 +158,9 @@ def mix_mirrored(
     light: wp.array,
     mean_radiance: wp.array,
     transmittance: wp.array,
+    radiosity: wp.array | None = None,
 ) -> wp.array:
-    """Mix the radiance M that metals add to the mean radiance of blockers in each sample.
+    """Mix the radiance M that bodies add to the mean radiance of blockers in each sample.
 
     Args:
         hits, faces: As of :func:`mirror`.
@@ -164,6 +169,7 @@ def mix_mirrored(
         light: L, vec3 of shape [batch, receiver, sample].
         mean_radiance: R̄, of :func:`.reflection.find_blocked_radiance`, vec3 of shape [batch, receiver].
         transmittance: T, float32 of shape [batch, receiver, sample].
+        radiosity: B, of the sides of faces, vec3 of shape [batch, 2 · face]; None for R̄.
             Any batch may be 1 and then serves every instance.
 
     Returns:
@@ -172,7 +178,7 @@ def mix_mirrored(
     Differentiable: all but hits.
     """
     values = {"albedo": albedo, "metallic": metallic, "filters": filters, "light": light, "blocked": mean_radiance}
-    values["transmittance"] = transmittance
+    values |= {"transmittance": transmittance, "radiosity": radiosity}
     shape = common_batch({"hits": hits.face_ids, **values}), *light.shape[1:]
     radiance = wp.empty(shape, dtype=wp.vec3, device=light.device)
     launch(
@@ -184,6 +190,7 @@ def mix_mirrored(
             albedo,
             metallic,
             *(array for array in (filters, light, mean_radiance, transmittance) if len(array) < shape[0]),
+            *(array for array in (radiosity,) if array is not None),
         ],
         cost=_COST * shape[2],
     )
