@@ -76,7 +76,7 @@ BANNED_EVERYWHERE = {
     *("_ById", "_see_by", "DirectLightOfPortion", "lobe_sum", "projected_patches", "ProjectedPatches"),
     *("shows_gloss", "total_grazing", "VisibilityOfPortion", "where_edges_are"),
     *("Bouncing", "casting_mesh", "CatchersAlone", "find_mean_slopes", "for_picture", "Gathering", "hold_fragments"),
-    *("NearLight", "own_shell", "own_tape", "wants_samples"),
+    *("NearLight", "own_shell", "own_tape", "share", "shares", "wants_samples"),
 }
 """Replaced names of methods and fields, too, which were not to be understood even with their object's name."""
 BANNED_PARTS = {"asked", "kept", "meant", "most", "pull", "pulled", "said", "taken", "told", "wanted"}

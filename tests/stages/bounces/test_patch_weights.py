@@ -38,7 +38,7 @@ def find(normals, past_self, past_all, device):
 
 
 def shares(normals, past_self, past_all, device):
-    return find(normals, past_self, past_all, device).shares
+    return find(normals, past_self, past_all, device).sample_weights
 
 
 @pytest.mark.parametrize(("name", "twin"), [("shares", twin_shares), ("weights", twin_weights)])

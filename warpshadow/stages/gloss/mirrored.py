@@ -133,7 +133,7 @@ def _mix_mirrored(
     if face >= 0:
         weights = barycentrics[hit_batch, receiver, sample]
         color = interpolate_at(albedo[instance_in(batch, albedo.shape[0])], faces[face], weights)
-        share = interpolate_at(metallic[instance_in(batch, metallic.shape[0])], faces[face], weights)
+        metal_share = interpolate_at(metallic[instance_in(batch, metallic.shape[0])], faces[face], weights)
         grazing = filters[instance_in(batch, filters.shape[0]), receiver, sample][0]
         seen = mean
         if last_ray == MEETS_SKY:
@@ -141,7 +141,7 @@ def _mix_mirrored(
         if last_ray == LEAVES_BELOW:
             seen = wp.vec3()
         fresnel = color + grazing * (wp.vec3(1.0) - color)
-        result = share * blocked * (wp.cw_mul(fresnel, seen) - mean)
+        result = metal_share * blocked * (wp.cw_mul(fresnel, seen) - mean)
     radiance[batch, receiver, sample] = result
 
 

@@ -60,10 +60,10 @@ def _sum_lobes(
     grazing_sum = wp.vec3()
     for i in range(filters.shape[2]):
         weight = filters[filter_batch, receiver, i]
-        share = transmittance[transmittance_batch, receiver, i]
-        radiance = share * light[light_batch, receiver, i]
+        open_share = transmittance[transmittance_batch, receiver, i]
+        radiance = open_share * light[light_batch, receiver, i]
         if blocked_light:
-            radiance += (1.0 - share) * blocked_light[blocked_batch, receiver]
+            radiance += (1.0 - open_share) * blocked_light[blocked_batch, receiver]
         if mirrored_light:
             radiance += mirrored_light[mirrored_batch, receiver, i]
         straight_sum += weight[0] * radiance
@@ -126,8 +126,8 @@ def _find_blocked_radiance(
     batch, receiver = wp.tid()
     light = bounced_light[instance_in(batch, bounced_light.shape[0]), receiver]
     indirect_light = light - direct[instance_in(batch, direct.shape[0]), receiver]
-    share = 1.0 - openness[instance_in(batch, openness.shape[0]), receiver][0]
-    blocked_light[batch, receiver] = wp.max(indirect_light, wp.vec3()) / wp.max(share, MIN_BLOCKED_SHARE)
+    blocked_share = 1.0 - openness[instance_in(batch, openness.shape[0]), receiver][0]
+    blocked_light[batch, receiver] = wp.max(indirect_light, wp.vec3()) / wp.max(blocked_share, MIN_BLOCKED_SHARE)
 
 
 def find_blocked_radiance(bounced_light: wp.array, direct: wp.array, openness: wp.array) -> wp.array:
