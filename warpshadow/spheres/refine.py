@@ -86,7 +86,7 @@ def _make_view_sphere(lanes: int) -> wp.Function:
         )
         sphere_view.curvature = 1.0 / ball[3]
         sphere_view.cone = cone_of(sphere_view.offset, sphere_view.curvature)
-        sphere_view.cluster_weight = Lane(1.0)
+        sphere_view.merge_weight = Lane(1.0)
         return sphere_view
 
     return view_sphere

@@ -116,9 +116,7 @@ def make_sphere_adjoint(lanes: int) -> wp.Function:
             -wp.cw_mul(slope, sum_adj_t_t),
             adj_opacity,
         )
-        adj_cone = Cone(
-            scale(slope, sum_omega), adj_cosine, adj_sine2, wp.cw_mul(adj_weight, sphere_view.cluster_weight)
-        )
+        adj_cone = Cone(scale(slope, sum_omega), adj_cosine, adj_sine2, wp.cw_mul(adj_weight, sphere_view.merge_weight))
         adj_offset, adj_radius = cone_adjoint(sphere_view.offset, sphere_view.curvature, sphere_view.cone, adj_cone)
         return adj_offset, adj_radius, adj_weight, adj_cos_width, adj_sin_width
 

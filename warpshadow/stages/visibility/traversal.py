@@ -213,8 +213,8 @@ def sphere_view_type(lanes: int) -> Any:
         node: int
         offset: Vectors  # from the receivers to its center
         curvature: float  # 1/radius
-        cone: Cone  # its weight has that of the cluster as a factor
-        cluster_weight: Lane  # that merging gives the sphere
+        cone: Cone  # its weight has that of merging as a factor
+        merge_weight: Lane  # that merging gives the sphere
 
     return SphereView
 
@@ -283,14 +283,14 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                     adj_cluster_weight = Lane(0.0)
                     for item in range(NODES_PER_CLUSTER):
                         node = find_node(cluster, item, spheres.count, spheres.centers.shape[1])
-                        cluster_weight = Lane(1.0) - cluster_weight
+                        merge_weight = Lane(1.0) - cluster_weight
                         sign = float(-1.0)
                         if item == CLUSTER_SIZE:
-                            cluster_weight = cluster_weight
+                            merge_weight = cluster_weight
                             sign = 1.0
                         radius = float(0.0)
                         is_left_out = item < CLUSTER_SIZE and is_skipped(node, node + 1, spheres)
-                        if node >= 0 and not is_left_out and is_any_above(cluster_weight, 0.0):
+                        if node >= 0 and not is_left_out and is_any_above(merge_weight, 0.0):
                             radius = spheres.radii[batch, node]
                         if radius > TINY_RADIUS:
                             sphere_view = SphereView()
@@ -300,8 +300,8 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                             sphere_view.curvature = 1.0 / radius
                             sphere_view.cone = cone(sphere_view.offset, sphere_view.curvature)
                             cone_weight = sphere_view.cone.weight
-                            sphere_view.cone.weight = wp.cw_mul(cone_weight, cluster_weight)
-                            sphere_view.cluster_weight = cluster_weight
+                            sphere_view.cone.weight = wp.cw_mul(cone_weight, merge_weight)
+                            sphere_view.merge_weight = merge_weight
                             if wp.static(is_adjoint):
                                 adj_sphere = visit(receivers, sphere_view, count, task)
                                 if adj_sphere.is_any:
