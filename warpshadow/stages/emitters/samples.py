@@ -360,10 +360,10 @@ def may_light(beam: wp.vec3, area: wp.vec3, normal: wp.vec3, is_two_sided: int):
 @wp.func
 def sample_transmittance(transmittance: wp.array3d(dtype=wp.float32), batch: int, receiver: int, i: int):
     """Transmittance from a receiver to a sample, 1 where nothing blocks."""
-    through = float(1.0)
+    result = float(1.0)
     if transmittance:
-        through = transmittance[batch, receiver, i]
-    return through
+        result = transmittance[batch, receiver, i]
+    return result
 
 
 def place_samples(positions: wp.array, samples: EmitterSamples) -> PlacedSamples:
