@@ -131,7 +131,7 @@ def _make_project(lanes: int) -> wp.Kernel:
         for lane in range(lanes):
             i = block * lanes + lane
             axes[i, sphere] = wp.vec3(cone.axis.x[lane], cone.axis.y[lane], cone.axis.z[lane])
-            edges[i, sphere] = _SphereEdge(low[lane], slope[lane], opacity[lane])
+            edges[i, sphere] = _SphereEdge(low[lane], slope[lane], opacity[lane])  # type: ignore[call-arg]
             reached[i, sphere] = int(bits[lane])
 
     return project

@@ -312,7 +312,7 @@ def _measure_steps(
     moving: _MovingFactors,
 ):
     """Steps of a sample to its neighbors, or to the edges before these."""
-    steps = _ColorSteps(wp.vec2(), wp.vec4(), wp.vec2(), wp.vec2(1.0, 1.0))
+    steps = _ColorSteps(wp.vec2(), wp.vec4(), wp.vec2(), wp.vec2(1.0, 1.0))  # type: ignore[call-arg]
     for direction in range(4):
         axis = direction / 2
         sign = direction_sign(direction)
@@ -396,7 +396,7 @@ def _add_shading_gradients(
             adj_color = wp.vec3(adj_sample[0], adj_sample[1], adj_sample[2])
             # a sample that is a receiver has the gradient of the receiver's point instead
             is_receiver = image.face_ids[sample] >= first_sample_face
-            moving = _MovingFactors(not is_receiver, False)
+            moving = _MovingFactors(not is_receiver, False)  # type: ignore[call-arg]
             if has_mean_slope:
                 moving.light = moving.light or has_mean_slope[view_batch, sample]
             if albedo_has_mean_slope:
@@ -409,7 +409,7 @@ def _add_shading_gradients(
                 if entry >= 0:
                     image_weight = find_image_weight(fragment, entry, entries, line_areas, fragments.width)
                     image_weight = wp.max(image_weight, MIN_WEIGHT)
-                steps = _ColorSteps(wp.vec2(), wp.vec4(), wp.vec2(), wp.vec2(1.0, 1.0))
+                steps = _ColorSteps(wp.vec2(), wp.vec4(), wp.vec2(), wp.vec2(1.0, 1.0))  # type: ignore[call-arg]
                 if entry >= 0 or is_receiver or moving.albedo or not _is_surrounded(fragments, fragment):
                     steps = _measure_steps(image, fragments, entries, edges, sample, fragment, adj_color, moving)
                 if wp.length_sq(steps.to_edges) > 0.0:
