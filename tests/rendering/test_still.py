@@ -12,7 +12,7 @@ from warpshadow.pipeline.receivers.choice_of_receivers import for_still
 from warpshadow.scene.visibility import SHARED_DIRECTIONS
 from warpshadow.spheres import Spheres
 from warpshadow.stages.light.light_samples import cut_map
-from warpshadow.stages.ray_traced.shared_rays import TOLERANCE, Corners, find_shares, trace_shared
+from warpshadow.stages.ray_traced.shared_rays import TOLERANCE, Corners, find_light_shares, trace_shared
 from warpshadow.stages.rays.ray_packets import build_face_tree
 from warpshadow.stages.rays.ray_tracing import trace_visibility
 
@@ -127,11 +127,11 @@ def test_directions_go_where_receivers_see_light():
     at, facing = (wp.array(v, dtype=wp.vec3, device="cpu") for v in (points, np.tile([[0, 1, 0]], (5, 1))))
     even = ws.EnvironmentMap.constant(1.0).radiance
     plain = cut_map(even, 256)
-    shares = find_shares(tree, at, facing, plain)
+    shares = find_light_shares(tree, at, facing, plain)
     np.testing.assert_allclose(shares.sum(), 1, rtol=1e-5)
     assert (shares[plain.directions[0, :, 1] < 0] == 0).all()
-    aimed = cut_map(even, 256, lambda samples: find_shares(tree, at, facing, samples))
-    assert np.count_nonzero(find_shares(tree, at, facing, aimed)) > 1.5 * np.count_nonzero(shares)
+    aimed = cut_map(even, 256, lambda samples: find_light_shares(tree, at, facing, samples))
+    assert np.count_nonzero(find_light_shares(tree, at, facing, aimed)) > 1.5 * np.count_nonzero(shares)
     np.testing.assert_allclose(aimed.radiance.sum(), plain.radiance.sum(), rtol=0.02)
 
 

@@ -153,8 +153,10 @@ def stable_rotation(
     apex = points[hull.vertices].mean(axis=0)
     tetrahedra = np.abs(np.linalg.det(corners - apex))
     centroid = (tetrahedra[:, None] * (corners.sum(axis=1) + apex) / 4).sum(axis=0) / tetrahedra.sum()
-    shares = points_to_barycentric(corners, np.broadcast_to(centroid, downwards.shape))  # NaN of triangles of no area
-    supports = downwards[(shares >= -_INSIDE).all(axis=1)]
+    barycentrics = points_to_barycentric(
+        corners, np.broadcast_to(centroid, downwards.shape)
+    )  # NaN of triangles of no area
+    supports = downwards[(barycentrics >= -_INSIDE).all(axis=1)]
     arms = points[hull.vertices] - centroid
     returns = np.array([_returns_after_tilt(arms, down) for down in supports])
     supports = supports[returns] if returns.any() else supports

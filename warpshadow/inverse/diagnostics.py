@@ -164,14 +164,14 @@ def _free_factors(problem: Problem) -> dict[str, str]:
 
 def _warn_of_unseen(model: Model, images: torch.Tensor) -> bool:
     """Warn of pixels without a body; return whether there are."""
-    share = unseen_share(model, images)
-    if MAX_UNSEEN_SHARE < share < 1:  # of cameras that see nothing images warn
+    unseen = unseen_share(model, images)
+    if MAX_UNSEEN_SHARE < unseen < 1:  # of cameras that see nothing images warn
         check.warn(
-            f"{share:.0%} of the counted pixels see no body, and are explained as black; mask them out, or make the "
+            f"{unseen:.0%} of the counted pixels see no body, and are explained as black; mask them out, or make the "
             "ground larger",
             DiagnosticWarning,
         )
-    return share > MAX_UNSEEN_SHARE
+    return unseen > MAX_UNSEEN_SHARE
 
 
 def _warn_of_exposures(model: Model, images: torch.Tensor) -> bool:

@@ -194,9 +194,11 @@ class NormalMatrix:
         if model.targets.shape[-1] == 4:
             residuals.append(bounded_images[..., 3:] - model.targets[..., 3:])
         if not self.roots:
-            share = loss.pixel_shares(model.weights)[..., None]
+            weights = loss.pixel_shares(model.weights)[..., None]
             factors = (1.0, loss.coverage)
-            self.roots = [(f * share * loss.pixel_weights(x)).sqrt() for f, x in zip(factors, residuals, strict=False)]
+            self.roots = [
+                (f * weights * loss.pixel_weights(x)).sqrt() for f, x in zip(factors, residuals, strict=False)
+            ]
         parts = [roots * x for roots, x in zip(self.roots, residuals, strict=True)]
         if model.outlines is not None:
             gaps = model.outlines.differences(world.masks(), world.outline_offsets)

@@ -93,9 +93,9 @@ class ProjectedModel(Model):
         emitted = self.emitted(values)
         design = self.design(values, emitted).permute(4, 0, 1, 2, 3).flatten(2)  # [color, atom, pixel]
         target = ((self.targets[..., :3] - emitted) / self.context.unit).permute(3, 0, 1, 2).flatten(1)
-        share = self.problem.loss.pixel_shares(self.weights).flatten()
+        pixel_shares = self.problem.loss.pixel_shares(self.weights).flatten()
         prior = self.prior()
-        weights, radiance = share.expand_as(target), np.zeros((3, design.shape[1]))
+        weights, radiance = pixel_shares.expand_as(target), np.zeros((3, design.shape[1]))
         for _ in range(1 if self.problem.loss.kind == "l2" and self.saturated is None else _REWEIGHTINGS):
             for color in range(3):
                 weighted_design = design[color] * weights[color]
@@ -103,7 +103,7 @@ class ProjectedModel(Model):
                 slope = (weighted_design @ target[color]).double().cpu().numpy()
                 radiance[color] = nonnegative_least_squares(form, slope)
             images = torch.einsum("cap,ca->cp", design, torch.from_numpy(radiance).to(design))
-            weights = share * self._find_weights(images, target)
+            weights = pixel_shares * self._find_weights(images, target)
         self.solution = radiance.T
         self._store(self.solution[: len(self.atoms)], values[self.light.name])
         for lamp, unit, emission in zip(self.lamps, self.lamp_units, self.solution[len(self.atoms) :], strict=True):

@@ -75,9 +75,11 @@ def _is_close(points: np.ndarray, parts: Sequence[ConvexPart]) -> bool:
     lengths = _RADIUS * np.sqrt((np.arange(_RAYS) + 0.5) / _RAYS)
     rays = axes[:, :, None] + lengths[:, None] * ray_offsets / np.linalg.norm(ray_offsets, axis=-1, keepdims=True)
     hits = np.stack([_are_hit(points[part.corners[part.faces]], receivers[:, :, None], rays) for part in parts])
-    shares, covered = hits.mean(axis=-1), hits[:-1].any(axis=0).mean(axis=-1)  # [part, receiver, disc]
-    bounds, independent = np.minimum(shares[:-1].sum(axis=0), shares[-1]), 1 - np.prod(1 - shares[:-1], axis=0)
-    error, error_if_independent = (np.abs(shares - covered)[bounds > 0].mean() for shares in (bounds, independent))
+    coverages, covered = hits.mean(axis=-1), hits[:-1].any(axis=0).mean(axis=-1)  # [part, receiver, disc]
+    bounds, independent = np.minimum(coverages[:-1].sum(axis=0), coverages[-1]), 1 - np.prod(1 - coverages[:-1], axis=0)
+    error, error_if_independent = (
+        np.abs(coverages - covered)[bounds > 0].mean() for coverages in (bounds, independent)
+    )
     return bool(error <= min(MAX_EXCESS, error_if_independent / 2))
 
 

@@ -41,6 +41,6 @@ def inset_vertices(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     offsets -= (offsets * first_normals).sum(axis=1, keepdims=True) * first_normals
     distances = np.linalg.norm(offsets, axis=1)
     smallest = _ROUNDING * np.abs(points[faces]).max(initial=0.0)
-    shares = np.clip(smallest / np.maximum(distances, 1e-30), _SHARE, 0.5)
+    inset_shares = np.clip(smallest / np.maximum(distances, 1e-30), _SHARE, 0.5)
     is_moved = is_flat & (distances > 0)
-    return (points + np.where(is_moved, shares, 0.0)[:, None] * offsets).astype(np.float32)
+    return (points + np.where(is_moved, inset_shares, 0.0)[:, None] * offsets).astype(np.float32)

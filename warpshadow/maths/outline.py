@@ -140,8 +140,8 @@ class _Cuts:
         """Whether a line from one corner to another crosses others, or passes a corner."""
         a, b = self._points[[corner, end]]
         line, offsets = b - a, self._points[[other for other in self._ends if other not in (corner, end)]] - a
-        heights, shares = _cross(line, offsets) / (line @ line), offsets @ line / (line @ line)
-        if ((np.abs(heights) < _STRAIGHT) & (shares > 0) & (shares < 1)).any():
+        heights, line_shares = _cross(line, offsets) / (line @ line), offsets @ line / (line @ line)
+        if ((np.abs(heights) < _STRAIGHT) & (line_shares > 0) & (line_shares < 1)).any():
             return True
         c, d = self._points[self._lines].swapaxes(0, 1)
         parts_ends = _cross(line, c - a) * _cross(line, d - a) < 0

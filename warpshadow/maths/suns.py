@@ -53,8 +53,8 @@ def separate_suns(radiance: np.ndarray) -> SeparatedLight:
     limit = _BRIGHTNESS * max(total, 0.0) / (4 * np.pi)
     pixels = np.flatnonzero(brightness > limit)
     directions = sh.equirectangular_directions(len(radiance)).reshape(-1, 3)[pixels]
-    shares = 1 - limit / brightness[pixels]
-    light = radiance.reshape(-1, 3)[pixels] * (shares * solid_angles[pixels])[:, None]
+    sun_shares = 1 - limit / brightness[pixels]
+    light = radiance.reshape(-1, 3)[pixels] * (sun_shares * solid_angles[pixels])[:, None]
     power = light.mean(axis=1)
     is_candidate, is_sun = np.ones(len(pixels), bool), np.zeros(len(pixels), bool)
     suns: list[tuple[np.ndarray, np.ndarray, float]] = []
@@ -84,7 +84,7 @@ def separate_suns(radiance: np.ndarray) -> SeparatedLight:
         is_sun |= is_in_disc
         is_candidate &= ~(is_in_disc if is_in_disc.any() else from_brightest > np.cos(2 * _RADII[0]))
     without_suns = radiance.reshape(-1, 3).copy()
-    without_suns[pixels[is_sun]] *= (1 - shares[is_sun])[:, None]
+    without_suns[pixels[is_sun]] *= (1 - sun_shares[is_sun])[:, None]
     columns = np.array([[*direction, *irradiance, size] for direction, irradiance, size in suns]).reshape(-1, 7)
     suns_of_map = Suns(columns[:, :3], columns[:, 3:6], columns[:, 6])
     return SeparatedLight(suns_of_map, without_suns.reshape(radiance.shape))

@@ -75,12 +75,12 @@ def _overexposure(image: np.ndarray, photograph: np.ndarray, coverage: np.ndarra
     bright_values = image.max(axis=2)[coverage > _COVERED_SHARE]
     if not len(bright_values) or photograph.max() > 1:
         return None
-    share, usual = float((bright_values > 1).mean()), float((photograph >= 1).any(axis=2).mean())
-    if share <= usual + _MAX_WHITE_SHARE:
+    white, usual = float((bright_values > 1).mean()), float((photograph >= 1).any(axis=2).mean())
+    if white <= usual + _MAX_WHITE_SHARE:
         return None
     stops = math.floor(10 * (exposure - math.log2(np.percentile(bright_values, 99)))) / 10
     return (
-        f"{share:.0%} of the inserted pixels are brighter than white, as is {usual:.0%} of the photograph; with "
+        f"{white:.0%} of the inserted pixels are brighter than white, as is {usual:.0%} of the photograph; with "
         f"exposure = {stops:.1f} (--exposure {stops:.1f}) 1% is, or scale the light by {2 ** (stops - exposure):.2g}"
     )
 

@@ -207,11 +207,11 @@ def blurred_shell(scene: Scene) -> list[str]:
     light = scene.known_light
     if scene.shell is None or not scene.visibility.traits.has_cells or not isinstance(light, EnvironmentMap):
         return []
-    share = _share_of_brightest_half(light)
-    if share * scene.direction_count >= 1:
+    bright = _share_of_brightest_half(light)
+    if bright * scene.direction_count >= 1:
         return []
     return [
-        f"light: half of it comes from {share:.2%} of its shell, less than one of the {scene.direction_count} cells "
+        f"light: half of it comes from {bright:.2%} of its shell, less than one of the {scene.direction_count} cells "
         "through which bodies block it, so its shadows are blurred; stills have them sharp, as lamps do, "
         "Body(…, emission=…), and Visibility(directions=…) blurs them less"
     ]

@@ -52,8 +52,8 @@ def greedy_cover(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> 
     box_samples = mesh.low + rng.uniform(size=(6000, 3)) * (mesh.high - mesh.low)
     volume_samples = box_samples[mesh.signed_distances(box_samples)[0] < 0][: 1500 + count]
     samples = np.concatenate([volume_samples, surface_samples])
-    shares = [np.full(len(part), 0.5 / max(len(part), 1)) for part in (volume_samples, surface_samples)]
-    left = np.concatenate(shares).astype(np.float32)
+    sample_shares = [np.full(len(part), 0.5 / max(len(part), 1)) for part in (volume_samples, surface_samples)]
+    left = np.concatenate(sample_shares).astype(np.float32)
 
     cover_radii = balls[:, 3] + 0.1 * spacing
     squares = (samples**2).sum(axis=1)[:, None] + (balls[:, :3] ** 2).sum(axis=1) - 2 * samples @ balls[:, :3].T

@@ -93,9 +93,9 @@ def measure(mesh: NormalizedMesh, spheres: np.ndarray, seconds: float) -> FitRep
     if (spheres[:, 3] > 0).any():
         samples = ball_samples(16 * max(1, 512 // len(spheres)), rng)
         points = spheres[:, None, :3] + spheres[:, None, 3:] * samples
-        shares = np.broadcast_to(spheres[:, 3:] ** 3, points.shape[:2]) / _count_containing(spheres, points)
-        is_outside = mesh.signed_distances(points.reshape(-1, 3))[0].reshape(shares.shape) > 0
-        outside_volume = float(shares[is_outside].sum() / shares.sum())
+        volumes = np.broadcast_to(spheres[:, 3:] ** 3, points.shape[:2]) / _count_containing(spheres, points)
+        is_outside = mesh.signed_distances(points.reshape(-1, 3))[0].reshape(volumes.shape) > 0
+        outside_volume = float(volumes[is_outside].sum() / volumes.sum())
     surface, _ = mesh.sample(4000, rng)
     grown = spheres + [0, 0, 0, 0.01]
     air, _ = draw_points_around(mesh, NEARBY, rng)

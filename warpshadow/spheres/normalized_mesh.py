@@ -155,9 +155,9 @@ class NormalizedMesh:
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw points evenly from the surface: positions and interpolated normals, both [count, 3]."""
-        shares = np.cumsum(self.face_areas) / self.area
-        face_indices = np.searchsorted(shares, (np.arange(count) + rng.uniform(size=count)) / count)
-        face_indices = np.minimum(face_indices, len(shares) - 1)
+        area_shares = np.cumsum(self.face_areas) / self.area
+        face_indices = np.searchsorted(area_shares, (np.arange(count) + rng.uniform(size=count)) / count)
+        face_indices = np.minimum(face_indices, len(area_shares) - 1)
         u, v = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
         weights = np.stack([1 - u, u * (1 - v), u * v], axis=1)[:, :, None]
         corners = self.faces[face_indices]

@@ -47,6 +47,15 @@ _Sums = wp.types.vector(length=6, dtype=wp.float32)
 _FRAME_ROWS = 12  # numbers that say where a receiver is: its point, and the rows of its frame
 
 
+@wp.struct
+class _SphereEdge:
+    """The soft edge of a sphere as a receiver sees it: its opacity rises with the cosine between them."""
+
+    low: float  # lo, the cosine at which it begins
+    slope: float  # 1/(hi − lo)
+    opacity: float  # A, at its end
+
+
 @functools.cache
 def _make_frame_axis(lanes: int) -> wp.Function:
     """Make the kernel function of a row (step 1) or a column (step 3) of the frames of a block of receivers."""
@@ -77,7 +86,7 @@ def _make_view_sphere(lanes: int) -> wp.Function:
         )
         sphere_view.curvature = 1.0 / ball[3]
         sphere_view.cone = cone_of(sphere_view.offset, sphere_view.curvature)
-        sphere_view.share = Lane(1.0)
+        sphere_view.merge_weight = Lane(1.0)
         return sphere_view
 
     return view_sphere
@@ -100,10 +109,10 @@ def _make_project(lanes: int) -> wp.Kernel:
         caps: wp.array2d(dtype=wp.float32),
         # out
         axes: wp.array2d(dtype=wp.vec3),
-        edges: wp.array2d(dtype=wp.vec3),
+        edges: wp.array2d(dtype=_SphereEdge),
         reached: wp.array2d(dtype=wp.int32),
     ):
-        """A thread owns a block of receivers and a sphere: its direction; lo, 1/(hi − lo), opacity; bundles reached."""
+        """A thread owns a block of receivers and a sphere: its direction, its edge, and the bundles that it reaches."""
         row, sphere = wp.tid()
         block = first_row + row
         sphere_view = view_sphere(frame_rows, block, balls[sphere])
@@ -122,7 +131,7 @@ def _make_project(lanes: int) -> wp.Kernel:
         for lane in range(lanes):
             i = block * lanes + lane
             axes[i, sphere] = wp.vec3(cone.axis.x[lane], cone.axis.y[lane], cone.axis.z[lane])
-            edges[i, sphere] = wp.vec3(low[lane], slope[lane], opacity[lane])
+            edges[i, sphere] = _SphereEdge(low[lane], slope[lane], opacity[lane])  # type: ignore[call-arg]
             reached[i, sphere] = int(bits[lane])
 
     return project
@@ -144,7 +153,7 @@ def _make_project_adjoint(lanes: int) -> wp.Kernel:
         balls: wp.array(dtype=wp.vec4),
         cos_width: float,
         sin_width: float,
-        edges: wp.array2d(dtype=wp.vec3),
+        edges: wp.array2d(dtype=_SphereEdge),
         sums: wp.array2d(dtype=_Sums),
         # out
         adj_balls: wp.array2d(dtype=wp.vec4),
@@ -166,14 +175,14 @@ def _make_project_adjoint(lanes: int) -> wp.Kernel:
             i = block * lanes + lane
             edge = edges[i, sphere]
             gradient = sums[i, sphere]
-            factor = -6.0 * edge[2]
+            factor = -6.0 * edge.opacity
             x[lane] = factor * gradient[0]
             y[lane] = factor * gradient[1]
             z[lane] = factor * gradient[2]
             sum_[lane] = factor * gradient[3]
             sum_t[lane] = factor * gradient[4]
             adj_opacity[lane] = -gradient[5]
-            slope[lane] = edge[1]
+            slope[lane] = edge.slope
         adj_offset, adj_radius, _, _, _ = sphere_adjoint(
             sphere_view, sine, low, Lane(cos_width), Lane(sin_width), slope, adj_opacity, sum_, sum_t, Vectors(x, y, z)
         )
@@ -193,7 +202,7 @@ def _transmit(
     worker: int,
     # in
     axes: wp.array2d[wp.vec3],
-    edges: wp.array2d[wp.vec3],
+    edges: wp.array2d[_SphereEdge],
     reached: wp.array2d[int],
     directions: wp.array2d[_Bundle],
     # out
@@ -209,10 +218,11 @@ def _transmit(
     for sphere in range(axes.shape[1]):
         if (reached[i, sphere] >> bundle) & 1 != 0:
             edge = edges[i, sphere]
-            axis = edge[1] * axes[i, sphere]
-            t = axis[0] * x + axis[1] * y + axis[2] * z - _Bundle(edge[0] * edge[1])
+            axis = edge.slope * axes[i, sphere]
+            t = axis[0] * x + axis[1] * y + axis[2] * z - _Bundle(edge.low * edge.slope)
             t = wp.min(wp.max(t, _Bundle(0.0)), _Bundle(1.0))
-            passing = wp.cw_mul(passing, _Bundle(1.0) - edge[2] * wp.cw_mul(wp.cw_mul(t, t), _Bundle(3.0) - 2.0 * t))
+            step = wp.cw_mul(wp.cw_mul(t, t), _Bundle(3.0) - 2.0 * t)
+            passing = wp.cw_mul(passing, _Bundle(1.0) - edge.opacity * step)
     transmittance[i, bundle] = passing
 
 
@@ -226,7 +236,8 @@ _EDGE_SUMS = f"""
 const int bundles = directions.shape[1], count = bundles * {FIT_BUNDLE};
 const float *x = (const float*)directions.data, *y = x + count, *z = y + count;
 const float *up = (const float*)upstream.data + (size_t)i * count;
-const float ux = axis[0] * edge[1], uy = axis[1] * edge[1], uz = axis[2] * edge[1], u0 = edge[0] * edge[1];
+const float slope = edge.slope;
+const float ux = axis[0] * slope, uy = axis[1] * slope, uz = axis[2] * slope, u0 = edge.low * slope;
 float sum[6][{FIT_BUNDLE}] = {{}};
 for (int bundle = 0; bundle < bundles; ++bundle) {{
     if (!((reached >> bundle) & 1))
@@ -238,16 +249,16 @@ for (int bundle = 0; bundle < bundles; ++bundle) {{
         t = t < 0.f ? 0.f : t;
         t = t > 1.f ? 1.f : t;
         const float s = t * t * (3.f - 2.f * t);
-        float passing = 1.f - edge[2] * s;
+        float passing = 1.f - edge.opacity * s;
         passing = passing < 1e-6f ? 1e-6f : passing;
-        const float share = up[q] / passing;
-        const float g = share * t * (1.f - t);
+        const float by_log = up[q] / passing;
+        const float g = by_log * t * (1.f - t);
         sum[0][l] += g * x[q];
         sum[1][l] += g * y[q];
         sum[2][l] += g * z[q];
         sum[3][l] += g;
         sum[4][l] += g * t;
-        sum[5][l] += share * s;
+        sum[5][l] += by_log * s;
     }}
 }}
 wp::vec_t<6, wp::float32> sums;
@@ -265,7 +276,12 @@ return sums;
 
 @wp.func_native(_EDGE_SUMS)
 def _edge_sums(
-    axis: wp.vec3, edge: wp.vec3, reached: int, directions: wp.array2d[_Bundle], upstream: wp.array2d[_Bundle], i: int
+    axis: wp.vec3,
+    edge: _SphereEdge,
+    reached: int,
+    directions: wp.array2d[_Bundle],
+    upstream: wp.array2d[_Bundle],
+    i: int,
 ) -> _Sums: ...
 
 
@@ -275,7 +291,7 @@ def _transmit_adjoint(
     worker: int,
     # in
     axes: wp.array2d[wp.vec3],
-    edges: wp.array2d[wp.vec3],
+    edges: wp.array2d[_SphereEdge],
     reached: wp.array2d[int],
     directions: wp.array2d[_Bundle],
     upstream: wp.array2d[_Bundle],
@@ -286,7 +302,7 @@ def _transmit_adjoint(
     row, sphere = wp.tid()
     i = first_row + row
     gradient = _Sums()
-    if reached[i, sphere] != 0 and edges[i, sphere][2] > 0.0:
+    if reached[i, sphere] != 0 and edges[i, sphere].opacity > 0.0:
         gradient = _edge_sums(axes[i, sphere], edges[i, sphere], reached[i, sphere], directions, upstream, i)
     sums[i, sphere] = gradient
 
@@ -297,7 +313,7 @@ class _View(NamedTuple):
     frame_rows: wp.array  # [12, block] lanes
     balls: wp.array  # [sphere] vec4
     axes: wp.array  # [receiver, sphere] vec3
-    edges: wp.array  # [receiver, sphere] vec3
+    edges: wp.array  # [receiver, sphere] _SphereEdge
     reached: wp.array  # [receiver, sphere] int32: a bit for each bundle
 
 
@@ -358,7 +374,7 @@ class Refinement:
         frame_lanes = wp.array(frame_rows, dtype=lane_type(lanes), device=self.device)
         balls = wp.array(spheres.astype(np.float32), dtype=wp.vec4, device=self.device)
         shape = len(padded_indices), len(spheres)
-        outputs = [empty(shape, dtype=dtype, device=self.device) for dtype in (wp.vec3, wp.vec3, wp.int32)]
+        outputs = [empty(shape, dtype=dtype, device=self.device) for dtype in (wp.vec3, _SphereEdge, wp.int32)]
         launch(
             _make_project(lanes),
             (frame_lanes.shape[1], len(spheres)),

@@ -136,9 +136,9 @@ def _coverage_within_edges(
 
 
 @wp.func
-def _with_share(coverage: wp.vec4, share: float):
+def _with_cell_share(coverage: wp.vec4, cell_share: float):
     """A coverage with another share, of 0 to 1, and the same moment."""
-    return wp.vec4(wp.clamp(share, 0.0, 1.0), coverage[1], coverage[2], coverage[3])
+    return wp.vec4(wp.clamp(cell_share, 0.0, 1.0), coverage[1], coverage[2], coverage[3])
 
 
 @wp.func
@@ -155,7 +155,7 @@ def convex_coverage(edges: wp.array(dtype=ViewedEdge), first: int, count: int, d
         return wp.vec4(1.0, 0.0, 0.0, 0.0)
     winding = wp.where(min_cosine > 0.0, 1.0, 0.0)
     within_edges = _coverage_within_edges(edges, first, count, direction, radius)
-    return _with_share(within_edges, winding + within_edges[0])
+    return _with_cell_share(within_edges, winding + within_edges[0])
 
 
 @wp.func
@@ -185,7 +185,7 @@ def outline_coverage(
     within_edges = wp.vec4()
     if min_abs_cosine < radius:
         within_edges = _coverage_within_edges(edges, first, count, direction, radius)
-    return _with_share(within_edges, float(winding) + within_edges[0])
+    return _with_cell_share(within_edges, float(winding) + within_edges[0])
 
 
 @wp.func

@@ -37,9 +37,9 @@ _PASS_COST = 1.0  # time of a cell [ns]
 @wp.func
 def _open_share(coverage: wp.vec4, other: wp.vec4):
     """T past two blockers of a cell; it calls no function, whose slopes ``wp.grad`` may leave out."""
-    share = wp.clamp(coverage[0], 0.0, 1.0)
+    cell_share = wp.clamp(coverage[0], 0.0, 1.0)
     other_share = wp.clamp(other[0], 0.0, 1.0)
-    u = share * (1.0 - share)
+    u = cell_share * (1.0 - cell_share)
     v = other_share * (1.0 - other_share)
     bound = u * (MOMENT_BOUND[0] + u * (MOMENT_BOUND[1] + u * MOMENT_BOUND[2]))
     other_bound = v * (MOMENT_BOUND[0] + v * (MOMENT_BOUND[1] + v * MOMENT_BOUND[2]))
@@ -51,8 +51,10 @@ def _open_share(coverage: wp.vec4, other: wp.vec4):
     bound_pairs = bound_sum * bound_sum - (bound * bound + other_bound * other_bound) + MIN_BOUNDS
     relation = wp.clamp(moment_pairs / bound_pairs, -1.0, 1.0)
     weight = wp.abs(relation)
-    related = wp.where(relation < 0.0, wp.max(0.0, 1.0 - (share + other_share)), 1.0 - wp.max(share, other_share))
-    return (1.0 - weight) * ((1.0 - share) * (1.0 - other_share)) + weight * related
+    related = wp.where(
+        relation < 0.0, wp.max(0.0, 1.0 - (cell_share + other_share)), 1.0 - wp.max(cell_share, other_share)
+    )
+    return (1.0 - weight) * ((1.0 - cell_share) * (1.0 - other_share)) + weight * related
 
 
 @wp.func
@@ -75,15 +77,15 @@ def _attenuate(
     """A thread owns a receiver."""
     batch, receiver = split_row(first_row + wp.tid(), attenuated.shape[1])
     for q in range(attenuated.shape[2]):
-        share = wp.max(0.0, 1.0 - coverages[batch, receiver, q][0])
-        if others and share > 0.0:
-            if share < 1.0 and others[batch, receiver, q][0] > 0.0:
-                share = _open_share(coverages[batch, receiver, q], others[batch, receiver, q])
+        open_share = wp.max(0.0, 1.0 - coverages[batch, receiver, q][0])
+        if others and open_share > 0.0:
+            if open_share < 1.0 and others[batch, receiver, q][0] > 0.0:
+                open_share = _open_share(coverages[batch, receiver, q], others[batch, receiver, q])
             else:  # one of the two covers nothing, or all: the other's share is exact
-                share = wp.min(share, wp.clamp(1.0 - others[batch, receiver, q][0], 0.0, 1.0))
+                open_share = wp.min(open_share, wp.clamp(1.0 - others[batch, receiver, q][0], 0.0, 1.0))
         if transmittance:
-            share *= transmittance[batch, receiver, q]
-        attenuated[batch, receiver, q] = share
+            open_share *= transmittance[batch, receiver, q]
+        attenuated[batch, receiver, q] = open_share
 
 
 @wp.kernel(enable_backward=False)
@@ -109,17 +111,19 @@ def _attenuate_adjoint(
             other = wp.vec4()
             if others:
                 other = others[batch, receiver, q]
-            share = _open_share(coverage, other)
+            open_share = _open_share(coverage, other)
             adj_coverage = wp.vec4(wp.clamp(other[0], 0.0, 1.0) - 1.0, 0.0, 0.0, 0.0)
             adj_other = wp.vec4(wp.clamp(coverage[0], 0.0, 1.0) - 1.0, 0.0, 0.0, 0.0)
             if _is_partial(coverage) and _is_partial(other):
                 adj_coverage, adj_other = wp.grad(_open_share)(coverage, other)
-            if share > 0.0:
+            if open_share > 0.0:
                 factor = adj_cell
                 if transmittance:
                     factor = adj_cell * transmittance[batch, receiver, q]
                 if adj_transmittance:
-                    adj_transmittance[batch, receiver, q] = adj_transmittance[batch, receiver, q] + adj_cell * share
+                    adj_transmittance[batch, receiver, q] = (
+                        adj_transmittance[batch, receiver, q] + adj_cell * open_share
+                    )
                 if adj_coverages and _is_partial(coverage):
                     adj_coverages[batch, receiver, q] = adj_coverages[batch, receiver, q] + factor * adj_coverage
                 if adj_others and _is_partial(other):

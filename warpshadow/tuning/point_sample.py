@@ -128,8 +128,8 @@ class PointSample:
             for values in (self._positions, self._normals)
         )
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        shares = np.where(is_receiver[:, None], np.array([1, 0, 0], np.float32), self._weights)
-        return PointReceivers(points, normals, self._sides[receiver_rows], weights, corners, shares)
+        receiver_weights = np.where(is_receiver[:, None], np.array([1, 0, 0], np.float32), self._weights)
+        return PointReceivers(points, normals, self._sides[receiver_rows], weights, corners, receiver_weights)
 
     def error(self, shading: np.ndarray) -> float:
         """Relative L2 error ‖B − B_mesh‖ / ‖B_mesh‖ of shading [point, 3] against rays."""

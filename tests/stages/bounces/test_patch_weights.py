@@ -21,7 +21,7 @@ def sums(normals, *transmittances):
     return [(cosines * passing).sum(axis=1) + HIDDEN for passing in transmittances]
 
 
-def twin_shares(normals, past_self, past_all):
+def twin_sample_weights(normals, past_self, past_all):
     (means,) = sums(normals, past_all)
     return np.repeat((means / np.bincount(PATCHES, WEIGHTS * means)[PATCHES])[:, None], 3, axis=1)
 
@@ -37,12 +37,12 @@ def find(normals, past_self, past_all, device):
     return find_patch_weights(find_mean_transmittance(normals, past_self, past_all, DIRECTIONS), mean, PATCHES)
 
 
-def shares(normals, past_self, past_all, device):
-    return find(normals, past_self, past_all, device).shares
+def sample_weights(normals, past_self, past_all, device):
+    return find(normals, past_self, past_all, device).sample_weights
 
 
-@pytest.mark.parametrize(("name", "twin"), [("shares", twin_shares), ("weights", twin_weights)])
-def test_shares_of_patch_samples_and_weights_of_patches_are_those_of_the_twin(name, twin, device):
+@pytest.mark.parametrize(("name", "twin"), [("sample_weights", twin_sample_weights), ("weights", twin_weights)])
+def test_weights_of_patch_samples_and_of_patches_are_those_of_the_twin(name, twin, device):
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(5, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -63,7 +63,9 @@ def test_a_buried_patch_sample_hardly_darkens_its_patch(has_self, device):
     light = wp.array(is_free[None, :, None] * np.ones(3), dtype=wp.vec3, device=device)
     white = wp.full((1, 3), wp.vec3(1.0), dtype=wp.vec3, device=device)
     mean = mean_over_patch_samples(PATCHES, WEIGHTS, 3, device=device)
-    weighted = patch_radiosity(white, light, mean, shares(normals, past_self, past_all, device)).numpy()[0, :, 0]
+    weighted = patch_radiosity(white, light, mean, sample_weights(normals, past_self, past_all, device)).numpy()[
+        0, :, 0
+    ]
     np.testing.assert_allclose(weighted, [1, 0, 1], atol=0.02)
     np.testing.assert_allclose(patch_radiosity(white, light, mean).numpy()[0, :, 0], [0.4, 0, 0.7], atol=1e-6)
 
@@ -71,7 +73,7 @@ def test_a_buried_patch_sample_hardly_darkens_its_patch(has_self, device):
 def test_of_a_patch_that_is_buried_wholly_all_patch_samples_count(device):
     normals = wp.array(np.tile(UP, (1, 5, 1)), dtype=wp.vec3, device=device)
     nothing = wp.zeros((1, 5, 32), dtype=wp.float32, device=device)
-    np.testing.assert_allclose(shares(normals, None, nothing, device).numpy(), 1, rtol=1e-5)
+    np.testing.assert_allclose(sample_weights(normals, None, nothing, device).numpy(), 1, rtol=1e-5)
 
 
 def test_what_does_not_fit_is_refused(device):

@@ -217,11 +217,11 @@ class Texture(FreeOfBody):
     def _first_colors(self, texels: torch.Tensor) -> torch.Tensor:
         """Colors of a palette, [color, 3]: quantiles of the texels by brightness; grays if all texels are alike."""
         flat = texels.reshape(-1, 3)
-        shares = (torch.arange(self.colors, device=texels.device) + 0.5) / self.colors
+        quantiles = (torch.arange(self.colors, device=texels.device) + 0.5) / self.colors
         if flat.std(dim=0).max() < _MAX_PLAIN_DEVIATION:
-            return shares[:, None].expand(-1, 3).contiguous()
+            return quantiles[:, None].expand(-1, 3).contiguous()
         ranked_colors = flat[flat.sum(dim=1).argsort()]
-        return ranked_colors[(shares * len(flat)).long()]
+        return ranked_colors[(quantiles * len(flat)).long()]
 
     def apply(self, values: Values, context: FitContext, world: World) -> None:
         world.textures[self.number] = values["texels"]

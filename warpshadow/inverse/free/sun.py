@@ -131,8 +131,8 @@ class Sun(Free):
         cells = torch.tensor(self.basis.directions).to(direction)
         variance = radius**2 / 4 - self._spacing**2 / (4 * np.pi)  # of the weights: cells are wide themselves
         weights = _weights(direction, variance, cells)
-        share = weights @ (cells @ direction).clamp_min(0)
-        light = self.directions / (4 * np.pi) * (weights / share)[:, None] * strength
+        unit_irradiance = weights @ (cells @ direction).clamp_min(0)
+        light = self.directions / (4 * np.pi) * (weights / unit_irradiance)[:, None] * strength
         return light.to(values["turn"])
 
     def apply(self, values: Values, context: FitContext, world: World) -> None:

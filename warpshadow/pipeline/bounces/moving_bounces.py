@@ -168,7 +168,7 @@ class Radiosity(Node):
                 outgoing = outgoing_of(radiosity)
                 portions = [self._gatherer.add_bounced(self, call, portion, outgoing) for portion in lit]
             with self.timed(call, self._reflection):
-                return patch_radiosity(albedo, join_portions(portions), senders.mean, weights.shares)
+                return patch_radiosity(albedo, join_portions(portions), senders.mean, weights.sample_weights)
 
         def add_radiosity_by_self(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             if self_factors is None or radiosity is None:

@@ -132,10 +132,10 @@ class ScenePatches:
         areas = {n: body.scale**2 * body.mesh.area for n, body in enumerate(bodies) if n not in self.planes}
         total, counts = sum(areas.values()), {}
         for number, area in areas.items():
-            share = _SCENE_PATCHES * area / total if total > 0 else _MIN_BODY_PATCHES
+            patch_count = _SCENE_PATCHES * area / total if total > 0 else _MIN_BODY_PATCHES
             counts[number] = _patch_count(bodies[number].mesh)
             if len(areas) * MAX_PATCHES > _SCENE_PATCHES:
-                maximum = int(2 ** np.floor(np.log2(max(share, _MIN_BODY_PATCHES))))
+                maximum = int(2 ** np.floor(np.log2(max(patch_count, _MIN_BODY_PATCHES))))
                 counts[number] = min(counts[number], maximum)
         return counts
 

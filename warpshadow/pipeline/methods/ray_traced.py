@@ -20,7 +20,7 @@ from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.gloss.reflection import find_blocked_radiance
 from warpshadow.stages.gloss.traced_lobes import trace_lobes
 from warpshadow.stages.light.light_samples import cut_map, sample_map
-from warpshadow.stages.ray_traced.shared_rays import find_corners, find_shares, trace_shared
+from warpshadow.stages.ray_traced.shared_rays import find_corners, find_light_shares, trace_shared
 from warpshadow.stages.ray_traced.traced_transfer import trace_transfer
 from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, build_face_tree
 from warpshadow.stages.rays.ray_tracing import trace_shading
@@ -190,7 +190,9 @@ class RayTraced(Method):
             arguments, options = (tree, origins, normals), {"shell": instance_shell}
             # a ratio image has the same directions with the bodies and without
             share_finder = (
-                None if self.merged_scene.scene.catchers else functools.partial(find_shares, *arguments, **options)
+                None
+                if self.merged_scene.scene.catchers
+                else functools.partial(find_light_shares, *arguments, **options)
             )
             samples = cut_map(light.radiance, count, share_finder)
             corners = None

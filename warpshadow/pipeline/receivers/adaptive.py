@@ -44,7 +44,7 @@ def find_squares(
     row, column = probe_grid(sides.shape[1:], supersampling)
     numbers, probes = _order_by_tiles(sides.shape[1:], supersampling)
     body_of_probe = bodies[sides.numpy().reshape(len(sides), -1)[:, probes[:-1]]]
-    shares = np.zeros((len(sides), len(probes)), np.float32)  # the last is of no probe
+    light_ratios = np.zeros((len(sides), len(probes)), np.float32)  # the last is of no probe
     with unrecorded():
         for body in np.flatnonzero(is_adaptive).tolist():
             columns = _list_chosen(body_of_probe == body)
@@ -56,9 +56,9 @@ def find_squares(
             portions = [share_of_sharpest_light(portion) for portion in group.portions()]
             known = [portion for portion in portions if portion is not None]
             if known:
-                shares[np.arange(len(sides))[:, None], numbers[columns]] = np.concatenate(known, axis=1)
-    shares_of_grid = shares[:, :-1].reshape(len(sides), len(row), len(column))
-    return find_quadtree(sides, keys, shares_of_grid, supersampling)
+                light_ratios[np.arange(len(sides))[:, None], numbers[columns]] = np.concatenate(known, axis=1)
+    ratios_of_grid = light_ratios[:, :-1].reshape(len(sides), len(row), len(column))
+    return find_quadtree(sides, keys, ratios_of_grid, supersampling)
 
 
 @functools.lru_cache(maxsize=16)

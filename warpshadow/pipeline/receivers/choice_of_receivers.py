@@ -112,8 +112,8 @@ def choose_receivers(
     positions = np.concatenate([body.world_mesh().positions for body in merged_scene.scene.bodies])
     images = [_seen_faces(merged_scene, positions, camera) for camera in cameras]
     sizes = face_sizes(images, merged_scene, cameras[0])
-    share = LARGE_SHARE * cameras[0].width * cameras[0].height
-    largest = min(max(LARGE_FACE, share), COARSE_FACE)
+    large_face = LARGE_SHARE * cameras[0].width * cameras[0].height
+    largest = min(max(LARGE_FACE, large_face), COARSE_FACE)
     is_sharp = traits.has_cells and not is_light_free and merged_scene.device.is_cpu
     has_few = np.diff(merged_scene.first_face) <= FEW_FACES
     limits = np.where(has_few, 1.0, largest)
@@ -265,8 +265,8 @@ def _size_of(pixel_counts: np.ndarray, lengths: np.ndarray) -> FaceSize:
     if not len(lengths):
         return FaceSize(0.0, 0.0)
     falling = np.argsort(-lengths)
-    shares = np.cumsum(pixel_counts[falling]) / pixel_counts.sum()
-    return FaceSize(float(pixel_counts.mean()), float(lengths[falling][np.searchsorted(shares, _LONG_SHARE)]))
+    pixel_shares = np.cumsum(pixel_counts[falling]) / pixel_counts.sum()
+    return FaceSize(float(pixel_counts.mean()), float(lengths[falling][np.searchsorted(pixel_shares, _LONG_SHARE)]))
 
 
 def _longest_edges(corners: np.ndarray, camera: Camera) -> np.ndarray:

@@ -93,7 +93,7 @@ def mix_gloss(
     if materials.emission:
         highlights = method.highlights(points, materials, roughness, points.cameras)
         lobe_light = Node("", _add_highlights, lobe_light, highlights)
-    light_in_lobes = field_of(lobe_light, "straight"), field_of(lobe_light, "grazing")
+    light_in_lobes = field_of(lobe_light, "light_f0"), field_of(lobe_light, "light_f90")
     of_surface = field_of(samples, "cosines"), values["metallic"], values["specular"]
     mix = Node("reflection", mix_reflection, points.numbers, diffuse, *light_in_lobes, *of_surface, items=item_text)
     return field_of(mix, "colored"), field_of(mix, "white")

@@ -66,9 +66,9 @@ def find_bright_patches(
 
 
 @wp.func
-def point_of_bright_side(bright: BrightPatches, corners: wp.array(dtype=wp.vec3), share: float, u: float, v: float):
+def point_of_bright_side(bright: BrightPatches, corners: wp.array(dtype=wp.vec3), choice: float, u: float, v: float):
     """Draw a side of bright patches and a point on it, given three numbers even in [0, 1)."""
-    side = bright.sides[wp.min(wp.lower_bound(bright.distribution, share), bright.sides.shape[0] - 1)]
+    side = bright.sides[wp.min(wp.lower_bound(bright.distribution, choice), bright.sides.shape[0] - 1)]
     face = side % (corners.shape[0] // 3)
     root = wp.sqrt(u)
     point = (

@@ -99,8 +99,8 @@ def _make_sum_hits() -> wp.Kernel:
                             ray_count,
                         )
         for ray in range(bright.ray_count):
-            share = (float(ray) + wp.randf(state)) / float(bright.ray_count)
-            side, target = point_of_bright_side(bright, corners, share, wp.randf(state), wp.randf(state))
+            choice = (float(ray) + wp.randf(state)) / float(bright.ray_count)
+            side, target = point_of_bright_side(bright, corners, choice, wp.randf(state), wp.randf(state))
             ray_direction = wp.normalize(target - point)
             if wp.dot(normal, ray_direction) > 0.0:
                 hit = first_hit(mesh, point, normal, ray_direction)

@@ -139,20 +139,22 @@ def find_mean_transmittance(
 
 
 @wp.kernel
-def _find_shares_and_weights(
+def _find_weights(
     # in
     mean_transmittance: wp.array2d(dtype=wp.vec3),
     means: wp.array2d(dtype=wp.vec3),
     patch_of_sample: wp.array(dtype=wp.int32),
     # out
-    shares: wp.array2d(dtype=wp.vec3),
+    sample_weights: wp.array2d(dtype=wp.vec3),
     weights: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a patch sample of an instance: f; or a patch: v, 0 for one without samples; in three channels."""
     batch, item = wp.tid()
-    patch = item - shares.shape[1]
+    patch = item - sample_weights.shape[1]
     if patch < 0:
-        shares[batch, item] = wp.vec3(mean_transmittance[batch, item][0] / means[batch, patch_of_sample[item]][0])
+        sample_weights[batch, item] = wp.vec3(
+            mean_transmittance[batch, item][0] / means[batch, patch_of_sample[item]][0]
+        )
     else:
         mean = means[batch, patch]
         weight = float(0.0)
@@ -168,7 +170,7 @@ def _find_shares_and_weights(
 class PatchWeights(NamedTuple):
     """Weights of patch samples and patches, in three equal channels."""
 
-    shares: wp.array  # f, of patch samples in their patches, vec3 of shape [batch, patch sample]
+    sample_weights: wp.array  # f, of patch samples in their patches, vec3 of shape [batch, patch sample]
     weights: wp.array  # v, of patches among others, vec3 of shape [batch, patch]
 
 
@@ -185,8 +187,9 @@ def find_patch_weights(mean_transmittance: wp.array, mean: SparseMatrix, patch_o
     check.shape("patch_of_sample", patch_of_sample.shape, (mean_transmittance.shape[1],))
     patch_indices = constant(np.asarray(patch_of_sample, np.int32), wp.int32, mean_transmittance.device)
     means = multiply(mean, mean_transmittance)
-    shares = empty(mean_transmittance.shape, dtype=wp.vec3, device=mean_transmittance.device)
+    sample_weights = empty(mean_transmittance.shape, dtype=wp.vec3, device=mean_transmittance.device)
     weights = empty(means.shape, dtype=wp.vec3, device=mean_transmittance.device)
-    dim, inputs = (len(shares), shares.shape[1] + weights.shape[1]), [mean_transmittance, means, patch_indices]
-    launch(_find_shares_and_weights, dim, inputs=inputs, outputs=[shares, weights])
-    return PatchWeights(shares, weights)
+    dim = len(means), sample_weights.shape[1] + weights.shape[1]
+    inputs = [mean_transmittance, means, patch_indices]
+    launch(_find_weights, dim, inputs=inputs, outputs=[sample_weights, weights])
+    return PatchWeights(sample_weights, weights)

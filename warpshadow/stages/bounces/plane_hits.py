@@ -210,8 +210,8 @@ def _block_each_other_adjoint(
 @wp.func
 def _open_part(hit: PlaneHit, part_coverage: wp.vec4):
     """Share o of a side that neither nearer sides nor bodies before all planes block, and the moment m of these."""
-    share = wp.max(hit.open_share * (1.0 - part_coverage[0]), _MIN_OPEN)
-    return share, hit.blocked_moment + wp.vec3(part_coverage[1], part_coverage[2], part_coverage[3])
+    open_share = wp.max(hit.open_share * (1.0 - part_coverage[0]), _MIN_OPEN)
+    return open_share, hit.blocked_moment + wp.vec3(part_coverage[1], part_coverage[2], part_coverage[3])
 
 
 @wp.func
@@ -407,8 +407,8 @@ def _outline_hit_adjoint(
         adj_covered = wp.vec3(adj_hit.coverage * outline_share, 0.0, 0.0)
         adj_mip = fetch_adjoint(planes.covered, grid, planes, _first_level(side), footprint, mip, adj_covered)
         footprint_on_side_adjoint(planes, side, cell.direction, footprint, adj_mip, receiver.sides)
-    adj_share = adj_hit.coverage * hit.mesh_share
-    adj_outline = wp.vec4(adj_share * side.weight, 0.0, 0.0, 0.0)
+    adj_covered_share = adj_hit.coverage * hit.mesh_share
+    adj_outline = wp.vec4(adj_covered_share * side.weight, 0.0, 0.0, 0.0)
     if not is_alone:
         inverse_distance_on_side_adjoint(side, hit.inverse_distance, adj_hit.inverse_distance, receiver.sides)
         adj_moment = (side.weight / outline_share) * adj_hit.centroid
@@ -416,7 +416,7 @@ def _outline_hit_adjoint(
             -wp.dot(adj_moment, hit.centroid), adj_moment[0], adj_moment[1], adj_moment[2]
         )
     coverage_adjoint(receiver.edges, side.first_edge, grid.edge_count, cell.direction, cell.radius, adj_outline)
-    adj_weight = adj_share * outline_share / side.weight
+    adj_weight = adj_covered_share * outline_share / side.weight
     receiver.sides[side.index].adj_weight = receiver.sides[side.index].adj_weight + adj_weight
 
 

@@ -26,7 +26,7 @@ def _find_texels(
     # in
     starts: wp.array(dtype=wp.int32),
     patches: wp.array(dtype=wp.int32),
-    shares: wp.array(dtype=wp.float32),
+    mesh_shares: wp.array(dtype=wp.float32),
     radiosity: wp.array2d(dtype=wp.vec3),
     patch_weights: wp.array2d(dtype=wp.vec3),
     run: int,
@@ -40,7 +40,7 @@ def _find_texels(
         weight_sum = float(0.0)
         radiosity_sum = wp.vec3()
         for entry in range(starts[texel], starts[texel + 1]):
-            weight = shares[entry] * patch_weights[batch, patches[entry]][0]
+            weight = mesh_shares[entry] * patch_weights[batch, patches[entry]][0]
             weight_sum += weight
             radiosity_sum += weight * radiosity[batch, patches[entry]]
         weight_sums[batch, texel] = weight_sum
@@ -54,7 +54,7 @@ def _find_texels_adjoint(
     # in
     starts: wp.array(dtype=wp.int32),
     texel_indices: wp.array(dtype=wp.int32),
-    shares: wp.array(dtype=wp.float32),
+    mesh_shares: wp.array(dtype=wp.float32),
     radiosity: wp.array2d(dtype=wp.vec3),
     patch_weights: wp.array2d(dtype=wp.vec3),
     weight_sums: wp.array2d(dtype=wp.float32),
@@ -76,7 +76,7 @@ def _find_texels_adjoint(
         for entry in range(starts[patch], starts[patch + 1]):
             texel = texel_indices[entry]
             if weight_sums[batch, texel] > 0.0:
-                adj = (shares[entry] / weight_sums[batch, texel]) * adj_texels[batch, texel]
+                adj = (mesh_shares[entry] / weight_sums[batch, texel]) * adj_texels[batch, texel]
                 adj_sum += adj
                 adj_weight += wp.dot(adj, radiosity[batch, patch] - texels[batch, texel])
         if adj_radiosity:

@@ -66,7 +66,7 @@ def _tabulate(
     patch_weights: wp.array2d(dtype=wp.vec3),
     starts: wp.array(dtype=wp.int32),
     patch_indices: wp.array(dtype=wp.int32),
-    shares: wp.array(dtype=wp.float32),
+    area_shares: wp.array(dtype=wp.float32),
     black_sphere_weights: wp.array(dtype=wp.float32),
     length: int,
     # out
@@ -87,7 +87,7 @@ def _tabulate(
         for k in range(starts[proxy], starts[proxy + 1]):
             patch = patch_indices[k]
             counted_area = patch_weights[weights_batch, patch][0] * projected_areas[areas_batch, patch, direction]
-            patch_weight = shares[k] * (counted_area + _AVERTED_WEIGHT)
+            patch_weight = area_shares[k] * (counted_area + _AVERTED_WEIGHT)
             light += patch_weight * radiosity[radiosity_batch, patch]
             weight_sum += patch_weight
         proxy_radiance[batch, proxy, direction] = wp.vec4(light[0], light[1], light[2], weight_sum)
@@ -133,9 +133,9 @@ def find_proxy_radiance(
     device = radiosity.device
     proxies = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     area_sums = np.bincount(proxies, areas[patch_indices], len(starts) - 1)
-    shares = areas[patch_indices] / np.where(area_sums > 0, area_sums, 1)[proxies]
+    area_shares = areas[patch_indices] / np.where(area_sums > 0, area_sums, 1)[proxies]
     int_tables = [constant(np.asarray(values, np.int32), wp.int32, device) for values in (starts, patch_indices)]
-    float_tables = [shares, np.where(area_sums > 0, 0.0, _BLACK_SPHERE_WEIGHT)]
+    float_tables = [area_shares, np.where(area_sums > 0, 0.0, _BLACK_SPHERE_WEIGHT)]
     proxy_arrays = [*int_tables, *(constant(values.astype(np.float32), wp.float32, device) for values in float_tables)]
     proxy_radiance = empty((batch_count, len(starts) - 1, projected_areas.shape[2]), dtype=wp.vec4, device=device)
     length = run_length(device, projected_areas.shape[2])

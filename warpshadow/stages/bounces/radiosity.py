@@ -44,7 +44,7 @@ def patch_radiosity(
     albedo: wp.array,
     light: wp.array,
     mean: SparseMatrix,
-    shares: wp.array | None = None,
+    sample_weights: wp.array | None = None,
     addend: wp.array | None = None,
 ) -> wp.array:
     """Radiosity of patches: albedo times the mean light of their patch samples.
@@ -58,14 +58,14 @@ def patch_radiosity(
         light: Light that each patch sample would reflect if it were white, direct and bounced, vec3 of shape [batch,
             patch sample].
         mean: The weights w, from :func:`mean_over_patch_samples`.
-        shares: f, how much each patch sample counts, vec3 of shape [batch, patch sample], from
+        sample_weights: f, how much each patch sample counts, vec3 of shape [batch, patch sample], from
             :func:`.patch_weights.find_patch_weights`; None for 1.
         addend: c, other radiosity of the patches, vec3 of shape [batch, patch]; None for 0.
     Returns:
         vec3 of shape [batch, patch]; any batch may be 1, and then serves every instance.
-    Differentiable: albedo, light, shares, addend.
+    Differentiable: albedo, light, sample_weights, addend.
     """
-    return multiply(mean, light, addend=addend, row_scales=albedo, column_scales=shares)
+    return multiply(mean, light, addend=addend, row_scales=albedo, column_scales=sample_weights)
 
 
 def reflect(albedo: wp.array, light: wp.array) -> wp.array:

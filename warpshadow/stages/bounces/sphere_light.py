@@ -188,14 +188,14 @@ def _make_light(lanes: int) -> wp.Kernel:
         for i in range(BUNDLE):
             t, step = soft_edge(task.cells.directions[first_direction + i], cap, slope)
             if is_any_above(t, 0.0):
-                share = wp.cw_mul(opacity, step)
+                blocked_share = wp.cw_mul(opacity, step)
                 radiance = task.proxy_radiance[node, first_direction + i]
                 slot = (bundle * BUNDLE + i) * SUMS
                 # (a loop is not unrolled, and reads the radiance from memory)
-                task.sums[slot] = task.sums[slot] + radiance[0] * share
-                task.sums[slot + 1] = task.sums[slot + 1] + radiance[1] * share
-                task.sums[slot + 2] = task.sums[slot + 2] + radiance[2] * share
-                task.sums[slot + 3] = task.sums[slot + 3] + radiance[3] * share
+                task.sums[slot] = task.sums[slot] + radiance[0] * blocked_share
+                task.sums[slot + 1] = task.sums[slot + 1] + radiance[1] * blocked_share
+                task.sums[slot + 2] = task.sums[slot + 2] + radiance[2] * blocked_share
+                task.sums[slot + 3] = task.sums[slot + 3] + radiance[3] * blocked_share
 
     @wp.func(inline=True)
     def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: LightTask):
@@ -272,19 +272,21 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         return find_weight_of_proxy(sphere_view.offset, sphere_view.curvature, sphere_view.node, task.weights)
 
     @wp.func(inline=True)
-    def share_adjoint(sphere_view: SphereView, weight: Lane, share: Lane, slot: int, direction: int, task: LightTask):
+    def share_adjoint(
+        sphere_view: SphereView, weight: Lane, blocked_share: Lane, slot: int, direction: int, task: LightTask
+    ):
         """With f = 4/Q max(n·ω, 0) (F − T) / Σ w a S:  ā = w f (Ī·L − S Ī·R),  L̄ = f w a Ī,  S̄ = −f w a Ī·R."""
         weighted_factor = wp.cw_mul(weight, task.factors[slot])
         adj_cell = task.adj_cells[slot]
         radiance = task.proxy_radiance[sphere_view.node, direction]
         light = dot_direction(wp.vec3(radiance[0], radiance[1], radiance[2]), task.adj_light)
         if task.adj_radiance:
-            weighted_share = wp.cw_mul(weighted_factor, share)
+            weighted_blocked_share = wp.cw_mul(weighted_factor, blocked_share)
             adj_radiance_of_proxy = wp.vec4(
-                total(wp.cw_mul(weighted_share, task.adj_light.x)),
-                total(wp.cw_mul(weighted_share, task.adj_light.y)),
-                total(wp.cw_mul(weighted_share, task.adj_light.z)),
-                -total(wp.cw_mul(weighted_share, adj_cell)),
+                total(wp.cw_mul(weighted_blocked_share, task.adj_light.x)),
+                total(wp.cw_mul(weighted_blocked_share, task.adj_light.y)),
+                total(wp.cw_mul(weighted_blocked_share, task.adj_light.z)),
+                -total(wp.cw_mul(weighted_blocked_share, adj_cell)),
             )
             # summed over a warp first it took 1.4 times as long on an H200
             wp.atomic_add(task.adj_radiance, sphere_view.node, direction, adj_radiance_of_proxy)

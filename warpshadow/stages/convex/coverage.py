@@ -128,11 +128,11 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
             by_parts = task.coverage[q]
             by_hull = find_coverage(inputs.parts, silhouette, direction, inputs.radius)
             is_reached = is_positive(find_reach(task, bound, direction))  # not where the receiver lies on the hull
-            is_hull = wp.cw_mul(is_reached, is_positive(by_parts.share - by_hull.share))
+            is_hull = wp.cw_mul(is_reached, is_positive(by_parts.cell_share - by_hull.cell_share))
             is_parts = Lane(1.0) - is_hull
             task.is_hull[q] = is_hull
             task.coverage[q] = Coverages(
-                wp.cw_mul(is_parts, by_parts.share) + wp.cw_mul(is_hull, by_hull.share),
+                wp.cw_mul(is_parts, by_parts.cell_share) + wp.cw_mul(is_hull, by_hull.cell_share),
                 add(scale(is_parts, by_parts.moment), scale(is_hull, by_hull.moment)),
             )
 
@@ -154,7 +154,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
                     if reaches_bundle(bound, cells.axes[bundle], cells.half_angles[bundle]):
                         for q in range(bundle * BUNDLE, (bundle + 1) * BUNDLE):
                             direction = cells.directions[q]
-                            covered_share = task.coverage[q].share
+                            covered_share = task.coverage[q].cell_share
                             remaining_share = wp.min(Lane(max_sum) - covered_share, Lane(1.0) - task.sums[q].largest)
                             if sign < 0.0:
                                 remaining_share = wp.min(remaining_share, covered_share)  # prisms cover the same cells
@@ -167,13 +167,13 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
                                     is_found = True
                                 by_part = find_coverage(parts, silhouette, direction, radius)
                                 is_affected = is_positive(effect)
-                                if is_any_above(wp.cw_mul(is_affected, by_part.share), 0.0):
+                                if is_any_above(wp.cw_mul(is_affected, by_part.cell_share), 0.0):
                                     if not is_any_above(covered_share, 0.0):
                                         task.covered[covered_count] = q
                                         covered_count += 1
                                     factor = sign * is_affected
                                     task.coverage[q] = Coverages(
-                                        covered_share + wp.cw_mul(factor, by_part.share),
+                                        covered_share + wp.cw_mul(factor, by_part.cell_share),
                                         add(task.coverage[q].moment, scale(factor, by_part.moment)),
                                     )
         if covered_count > 0 and parts.hulls[compound] >= 0:
@@ -248,8 +248,8 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
     def is_any(coverage: Coverages):
         """Whether anything is not 0."""
         moment = coverage.moment
-        highest = wp.max(wp.max(coverage.share, moment.x), wp.max(moment.y, moment.z))
-        lowest = wp.min(wp.min(coverage.share, moment.x), wp.min(moment.y, moment.z))
+        highest = wp.max(wp.max(coverage.cell_share, moment.x), wp.max(moment.y, moment.z))
+        lowest = wp.min(wp.min(coverage.cell_share, moment.x), wp.min(moment.y, moment.z))
         return is_any_above(wp.max(highest, -lowest), 0.0)
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
@@ -298,7 +298,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
                 adj = adj_sums[task.slot, q]
                 adj_coverage = blocker_adjoint(task.sums[q], adj, task.coverage[q])
                 # of equal ones, as the front and the back of a mug at its outline, the first is the largest
-                difference = task.sums[q].largest - task.coverage[q].share
+                difference = task.sums[q].largest - task.coverage[q].cell_share
                 adj.largest = wp.cw_mul(adj.largest, is_positive(wp.max(difference, -difference)))
                 adj_sums[task.slot, q] = adj
                 task.coverage[q] = adj_coverage
@@ -330,7 +330,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
                                 by_hull = task.is_hull[q]
                                 factor = wp.cw_mul(factor, wp.where(number < end, Lane(1.0) - by_hull, by_hull))
                             adj_cell = Coverages(
-                                wp.cw_mul(factor, task.coverage[q].share), scale(factor, task.coverage[q].moment)
+                                wp.cw_mul(factor, task.coverage[q].cell_share), scale(factor, task.coverage[q].moment)
                             )
                             coverage_adjoint(parts, silhouette, direction, radius, adj_cell)
                     if is_found:

@@ -16,7 +16,7 @@ def coverage_type(lanes: int) -> Any:
 
     @wp.struct
     class Coverages:
-        share: Lane
+        cell_share: Lane
         moment: Vectors
 
     return Coverages
@@ -60,15 +60,15 @@ def make_joint_functions(lanes: int) -> JointFunctions:
     add, dot, scale, is_positive = fn.add, fn.dot, fn.scale, fn.is_positive
 
     @wp.func(inline=True)
-    def moment_bound(share: Lane):
-        u = wp.cw_mul(share, Lane(1.0) - share)
+    def moment_bound(cell_share: Lane):
+        u = wp.cw_mul(cell_share, Lane(1.0) - cell_share)
         return wp.cw_mul(u, Lane(MOMENT_BOUND[0]) + wp.cw_mul(u, Lane(MOMENT_BOUND[1]) + MOMENT_BOUND[2] * u))
 
     @wp.func(inline=True)
-    def moment_bound_slope(share: Lane):
-        u = wp.cw_mul(share, Lane(1.0) - share)
+    def moment_bound_slope(cell_share: Lane):
+        u = wp.cw_mul(cell_share, Lane(1.0) - cell_share)
         by_u = Lane(MOMENT_BOUND[0]) + wp.cw_mul(u, Lane(2.0 * MOMENT_BOUND[1]) + (3.0 * MOMENT_BOUND[2]) * u)
-        return wp.cw_mul(Lane(1.0) - 2.0 * share, by_u)
+        return wp.cw_mul(Lane(1.0) - 2.0 * cell_share, by_u)
 
     @wp.func(inline=True)
     def no_blockers():
@@ -80,12 +80,12 @@ def make_joint_functions(lanes: int) -> JointFunctions:
     @wp.func(inline=True)
     def with_blocker(sums: SumsOfBlockers, coverage: Coverages):
         """Sums over one blocker more."""
-        share = wp.min(wp.max(coverage.share, Lane(0.0)), Lane(1.0))
-        bound = moment_bound(share)
+        cell_share = wp.min(wp.max(coverage.cell_share, Lane(0.0)), Lane(1.0))
+        bound = moment_bound(cell_share)
         new_sums = SumsOfBlockers()
-        new_sums.total = sums.total + share
-        new_sums.product = wp.cw_mul(sums.product, Lane(1.0) - share)
-        new_sums.largest = wp.max(sums.largest, share)
+        new_sums.total = sums.total + cell_share
+        new_sums.product = wp.cw_mul(sums.product, Lane(1.0) - cell_share)
+        new_sums.largest = wp.max(sums.largest, cell_share)
         new_sums.moment = add(sums.moment, coverage.moment)
         new_sums.squares = sums.squares + dot(coverage.moment, coverage.moment)
         new_sums.bounds = sums.bounds + bound
@@ -112,27 +112,27 @@ def make_joint_functions(lanes: int) -> JointFunctions:
     def joint_coverage(sums: SumsOfBlockers):
         """Coverage by all blockers together."""
         _per_bounds, _relation, weight, _is_beside, related = relate(sums)
-        share = joint_share(sums, weight, related)
-        return Coverages(share, scale(wp.cw_div(share, wp.max(sums.total, Lane(1.0e-30))), sums.moment))
+        cell_share = joint_share(sums, weight, related)
+        return Coverages(cell_share, scale(wp.cw_div(cell_share, wp.max(sums.total, Lane(1.0e-30))), sums.moment))
 
     @wp.func(inline=True)
     def joint_coverage_adjoint(sums: SumsOfBlockers, adj_coverage: Coverages):
         """Gradients of the sums, 0 where one blocker covers all."""
         per_bounds, relation, weight, is_beside, related = relate(sums)
-        share = joint_share(sums, weight, related)
+        cell_share = joint_share(sums, weight, related)
         is_open = is_positive(Lane(1.0) - sums.largest)
         adj_moment = scale(is_open, adj_coverage.moment)
-        per_total = wp.cw_div(is_positive(share), wp.max(sums.total, Lane(1.0e-30)))
+        per_total = wp.cw_div(is_positive(cell_share), wp.max(sums.total, Lane(1.0e-30)))
         of_total = wp.cw_mul(dot(adj_moment, sums.moment), per_total)
-        of_moment = wp.cw_mul(share, per_total)
-        adj_share = wp.cw_mul(is_open, adj_coverage.share) + of_total
-        adj_related = wp.cw_mul(weight, adj_share)
+        of_moment = wp.cw_mul(cell_share, per_total)
+        adj_cell_share = wp.cw_mul(is_open, adj_coverage.cell_share) + of_total
+        adj_related = wp.cw_mul(weight, adj_cell_share)
         is_partial = wp.cw_mul(is_beside, is_positive(Lane(1.0) - sums.total))
         is_weighed = wp.cw_mul(is_positive(Lane(1.0) - weight), Lane(1.0) - 2.0 * is_beside)
-        adj_relation = wp.cw_mul(wp.cw_mul(is_weighed, adj_share), sums.product - related)
+        adj_relation = wp.cw_mul(wp.cw_mul(is_weighed, adj_cell_share), sums.product - related)
         adj_pairs = wp.cw_mul(adj_relation, per_bounds)
         adj = SumsOfBlockers()
-        adj.product = wp.cw_mul(weight - Lane(1.0), adj_share)
+        adj.product = wp.cw_mul(weight - Lane(1.0), adj_cell_share)
         adj.total = wp.cw_mul(is_partial, adj_related) - wp.cw_mul(of_total, of_moment)
         adj.largest = wp.cw_mul(Lane(1.0) - is_beside, adj_related)
         adj.moment = add(scale(2.0 * adj_pairs, sums.moment), scale(of_moment, adj_moment))
@@ -144,16 +144,16 @@ def make_joint_functions(lanes: int) -> JointFunctions:
     @wp.func(inline=True)
     def blocker_adjoint(sums: SumsOfBlockers, adj: SumsOfBlockers, coverage: Coverages):
         """Gradient of the coverage by one blocker, given those of the sums; 0 where that covers all or nothing."""
-        share = coverage.share
-        open_share = Lane(1.0) - share
-        is_partial = wp.cw_mul(is_positive(share), is_positive(open_share))
-        difference = wp.max(sums.largest - share, share - sums.largest)
-        adj_share = adj.total - wp.cw_div(wp.cw_mul(adj.product, sums.product), wp.max(open_share, Lane(1.0e-30)))
-        adj_share += wp.cw_mul(Lane(1.0) - is_positive(difference), adj.largest)
-        adj_bound = adj.bounds + 2.0 * wp.cw_mul(moment_bound(share), adj.bound_squares)
-        adj_share += wp.cw_mul(adj_bound, moment_bound_slope(share))
+        cell_share = coverage.cell_share
+        open_share = Lane(1.0) - cell_share
+        is_partial = wp.cw_mul(is_positive(cell_share), is_positive(open_share))
+        difference = wp.max(sums.largest - cell_share, cell_share - sums.largest)
+        adj_cell_share = adj.total - wp.cw_div(wp.cw_mul(adj.product, sums.product), wp.max(open_share, Lane(1.0e-30)))
+        adj_cell_share += wp.cw_mul(Lane(1.0) - is_positive(difference), adj.largest)
+        adj_bound = adj.bounds + 2.0 * wp.cw_mul(moment_bound(cell_share), adj.bound_squares)
+        adj_cell_share += wp.cw_mul(adj_bound, moment_bound_slope(cell_share))
         adj_moment = add(adj.moment, scale(2.0 * adj.squares, coverage.moment))
-        return Coverages(wp.cw_mul(is_partial, adj_share), scale(is_partial, adj_moment))
+        return Coverages(wp.cw_mul(is_partial, adj_cell_share), scale(is_partial, adj_moment))
 
     @wp.func_native(f"""
     for (int lane = 0; lane < {lanes}; ++lane) {{
@@ -162,7 +162,7 @@ def make_joint_functions(lanes: int) -> JointFunctions:
             wp::vec_t<4, float> value;
             if (receiver < rows.shape[0])
                 value = wp::index(rows, receiver, k);
-            wp::index(scratch, k).share.c[lane] = value.c[0];
+            wp::index(scratch, k).cell_share.c[lane] = value.c[0];
             wp::index(scratch, k).moment.x.c[lane] = value.c[1];
             wp::index(scratch, k).moment.y.c[lane] = value.c[2];
             wp::index(scratch, k).moment.z.c[lane] = value.c[3];
@@ -179,7 +179,7 @@ def make_joint_functions(lanes: int) -> JointFunctions:
     for (int receiver = first; receiver < past; ++receiver)
         for (int k = 0; k < rows.shape[1]; ++k) {{
             wp::vec_t<4, float>& value = wp::index(rows, receiver, k);
-            value.c[0] = wp::index(scratch, k).share.c[receiver - first];
+            value.c[0] = wp::index(scratch, k).cell_share.c[receiver - first];
             value.c[1] = wp::index(scratch, k).moment.x.c[receiver - first];
             value.c[2] = wp::index(scratch, k).moment.y.c[receiver - first];
             value.c[3] = wp::index(scratch, k).moment.z.c[receiver - first];

@@ -186,7 +186,7 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
     @wp.func_native(f"""
     const float pi = (float){wp.pi!r};
     const float per_moment = (float)1 / ((float)3 * pi * radius * radius * radius);
-    wp::vec_t<{lanes}, float> share;
+    wp::vec_t<{lanes}, float> cell_share;
     for (int lane = 0; lane < {lanes}; ++lane) {{
         const float cosine = nearest.c[lane], x = wp::index(sums, 1).c[lane], y = wp::index(sums, 2).c[lane];
         {ANGLE}
@@ -195,16 +195,16 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         const float sum = (cosine > (float)0 ? (float)1 : (float)0) + part;
         const float within = sum < (float)0 ? (float)0 : sum > (float)1 ? (float)1 : sum;
         const float covered = cosine >= radius ? (float)1 : cosine > -radius ? within : (float)0;
-        share.c[lane] = is_solid.c[lane] * covered;
+        cell_share.c[lane] = is_solid.c[lane] * covered;
     }}
     for (int lane = 0; lane < {lanes}; ++lane) {{
-        const bool crosses = nearest.c[lane] < radius && share.c[lane] > (float)0;
+        const bool crosses = nearest.c[lane] < radius && cell_share.c[lane] > (float)0;
         const float factor = crosses ? per_moment : (float)0;
         wp::index(sums, 4).c[lane] *= factor;
         wp::index(sums, 5).c[lane] *= factor;
         wp::index(sums, 6).c[lane] *= factor;
     }}
-    return share;
+    return cell_share;
     """)
     def finish_sums(nearest: Lane, is_solid: Lane, sums: wp.array(dtype=Lane), radius: float) -> Lane:  # type: ignore[empty-body, valid-type]
         """Share of a cell; its moment replaces the sum."""
@@ -221,7 +221,7 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         const float adj_z = per_moment * adj.moment.z.c[lane];
         const float foot_x = -distance * toward_x, foot_y = -distance * toward_y, foot_z = -distance * toward_z;
         // the integral of (at_foot + s slope) (direction + foot + s t) ds
-        const float at_foot = per_area * adj.share.c[lane] + adj_x * foot_x + adj_y * foot_y + adj_z * foot_z;
+        const float at_foot = per_area * adj.cell_share.c[lane] + adj_x * foot_x + adj_y * foot_y + adj_z * foot_z;
         const float slope = adj_x * tx + adj_y * ty + adj_z * tz;
         const float by_first = crosses ? (float)0.5 * (begin + end) * length : (float)0;
         const float cubes = (begin * begin + begin * end + end * end) / (float)3;
@@ -340,15 +340,17 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
                     a, b = silhouette.corners[edge[0]], silhouette.corners[edge[1]]
                     edges, sums = silhouette.edges, silhouette.sums
                     add_chord(silhouette.points, a, b, cosine, direction, radius, STRIDE * k, edges, sums)
-        share = finish_sums(nearest, silhouette.is_solid, silhouette.sums, radius)
-        return Coverages(share, Vectors(silhouette.sums[4], silhouette.sums[5], silhouette.sums[6]))
+        cell_share = finish_sums(nearest, silhouette.is_solid, silhouette.sums, radius)
+        return Coverages(cell_share, Vectors(silhouette.sums[4], silhouette.sums[5], silhouette.sums[6]))
 
     @wp.func
     def coverage_adjoint(
         parts: ConvexArrays, silhouette: Silhouette, direction: wp.vec3, radius: float, adj: Coverages
     ):
         """Add to the gradients of the edges' normals."""
-        adj_where_solid = Coverages(wp.cw_mul(silhouette.is_solid, adj.share), scale(silhouette.is_solid, adj.moment))
+        adj_where_solid = Coverages(
+            wp.cw_mul(silhouette.is_solid, adj.cell_share), scale(silhouette.is_solid, adj.moment)
+        )
         for k in range(silhouette.count):
             cosine = edge_cosine(silhouette, k, direction)
             if is_any_above(-wp.max(cosine, -cosine), -radius):

@@ -112,7 +112,7 @@ def _nearest_border(parts: PlacedPartArrays, part: int, beam: Beam):
 
 
 @wp.func
-def _share_within(border: Border, beam: Beam):
+def _blocked_share_within(border: Border, beam: Beam):
     """The share a of a part whose nearest border is known."""
     edge_normal = border.side * wp.normalize(wp.cross(border.begin - beam.point, border.end - beam.point))
     face_normal = wp.normalize(wp.cross(border.b - border.a, border.c - border.a))
@@ -122,23 +122,23 @@ def _share_within(border: Border, beam: Beam):
 
 
 @wp.func
-def _hidden_share(parts: PlacedPartArrays, part: int, beam: Beam):
+def _blocked_share(parts: PlacedPartArrays, part: int, beam: Beam):
     border = _nearest_border(parts, part, beam)
-    share = float(0.0)
+    blocked_share = float(0.0)
     if border.is_any:
-        share = _share_within(border, beam)
-    return share
+        blocked_share = _blocked_share_within(border, beam)
+    return blocked_share
 
 
 @wp.func
-def _hidden_share_adjoint(
+def _blocked_share_adjoint(
     parts: PlacedPartArrays, part: int, beam: Beam, adj_share: float, batch: int, adj_corners: wp.array2d(dtype=wp.vec3)
 ):
     """Gradients of the beam, given that of the share; those of corners are added."""
     adj = Beam()
     border = _nearest_border(parts, part, beam)
     if border.is_any:
-        slopes, beam_slopes = wp.grad(_share_within)(border, beam)
+        slopes, beam_slopes = wp.grad(_blocked_share_within)(border, beam)
         adj.point = adj_share * beam_slopes.point
         adj.offset = adj_share * beam_slopes.offset
         adj.radius = adj_share * beam_slopes.radius
@@ -236,17 +236,17 @@ def _may_hide(receiver: LitReceiver, part: int):
 
 
 @wp.func
-def _sum_shares(receiver: LitReceiver, piece: int, shares: wp.array(dtype=wp.float32)):
+def _sum_blocked_shares(receiver: LitReceiver, piece: int, blocked_shares: wp.array(dtype=wp.float32)):
     """Find Σ a of a piece for each sample; returns whether it may hide any."""
     hides = bool(False)
     for part in range(receiver.parts.arrays.first_part[piece], receiver.parts.arrays.first_part[piece + 1]):
         if _may_hide(receiver, part):
-            for i in range(shares.shape[0]):
+            for i in range(blocked_shares.shape[0]):
                 beam = _find_beam(receiver, i)
-                share = wp.where(hides, shares[i], 0.0)
+                blocked_share = wp.where(hides, blocked_shares[i], 0.0)
                 if beam.radius > 0.0:
-                    share += _hidden_share(receiver.parts, part, beam)
-                shares[i] = share
+                    blocked_share += _blocked_share(receiver.parts, part, beam)
+                blocked_shares[i] = blocked_share
             hides = True
     return hides
 
@@ -258,7 +258,7 @@ def _block_by_pieces(
     # in
     inputs: BeamInputs,
     # scratch
-    shares: wp.array2d(dtype=wp.float32),
+    blocked_shares: wp.array2d(dtype=wp.float32),
     # out
     log_transmittances: wp.array3d(dtype=wp.float32),
 ):
@@ -269,12 +269,12 @@ def _block_by_pieces(
     for i in range(logs.shape[0]):
         logs[i] = 0.0
     receiver = _find_receiver(inputs, batch, index)
-    share_sums = shares[scratch_slot(worker, row)]
+    blocked_sums = blocked_shares[scratch_slot(worker, row)]
     for piece in range(inputs.arrays.blocks.shape[0]):
-        if _is_blocker(inputs, piece) and _sum_shares(receiver, piece, share_sums):
+        if _is_blocker(inputs, piece) and _sum_blocked_shares(receiver, piece, blocked_sums):
             for i in range(logs.shape[0]):
-                if share_sums[i] > 0.0:
-                    logs[i] = logs[i] + log_transmittance(share_sums[i])
+                if blocked_sums[i] > 0.0:
+                    logs[i] = logs[i] + log_transmittance(blocked_sums[i])
 
 
 @wp.kernel(enable_backward=False)
@@ -285,7 +285,7 @@ def _block_by_pieces_adjoint(
     inputs: BeamInputs,
     adj_log_transmittances: wp.array3d(dtype=wp.float32),
     # scratch
-    shares: wp.array2d(dtype=wp.float32),
+    blocked_shares: wp.array2d(dtype=wp.float32),
     # out
     adj_points: wp.array2d(dtype=wp.vec3),
     # sums
@@ -297,20 +297,20 @@ def _block_by_pieces_adjoint(
     row = first_row + wp.tid()
     batch, index = split_row(row, adj_log_transmittances.shape[1])
     receiver = _find_receiver(inputs, batch, index)
-    share_sums = shares[scratch_slot(worker, row)]
+    blocked_sums = blocked_shares[scratch_slot(worker, row)]
     sample_batch = instance_in(batch, inputs.sample_points.shape[0])
     part_batch = instance_in(batch, inputs.corners.shape[0])
     adj_point = wp.vec3()
     for piece in range(inputs.arrays.blocks.shape[0]):
-        if _is_blocker(inputs, piece) and _sum_shares(receiver, piece, share_sums):
+        if _is_blocker(inputs, piece) and _sum_blocked_shares(receiver, piece, blocked_sums):
             for part in range(inputs.arrays.first_part[piece], inputs.arrays.first_part[piece + 1]):
                 if _may_hide(receiver, part):
-                    for i in range(share_sums.shape[0]):
-                        share = share_sums[i]
-                        if share > 0.0 and share < 1.0 - MIN_TRANSMITTANCE:
+                    for i in range(blocked_sums.shape[0]):
+                        blocked_share = blocked_sums[i]
+                        if blocked_share > 0.0 and blocked_share < 1.0 - MIN_TRANSMITTANCE:
                             beam = _find_beam(receiver, i)
-                            adj_share = -adj_log_transmittances[batch, index, i] / (1.0 - share)
-                            adj = _hidden_share_adjoint(receiver.parts, part, beam, adj_share, part_batch, adj_corners)
+                            adj_share = -adj_log_transmittances[batch, index, i] / (1.0 - blocked_share)
+                            adj = _blocked_share_adjoint(receiver.parts, part, beam, adj_share, part_batch, adj_corners)
                             adj_point += adj.point - adj.offset
                             sample = receiver.first_sample + i
                             if adj_sample_points:

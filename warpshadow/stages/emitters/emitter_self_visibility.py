@@ -196,12 +196,12 @@ def _look_up(
             cell = neighbors[texel, k]
             kernel_weight = wp.max(wp.dot(direction, cells[cell]) - reach_cosine, 0.0)
             weight = kernel_weight * kernel_weight + _NEGLIGIBLE
-            share = far_transmittance[i, cell]
+            cell_transmittance = far_transmittance[i, cell]
             middle = reach * distances[i, cell]
             nearness = 1.0 - wp.smoothstep(
                 (1.0 - _FALL_HALF_WIDTH) * middle, (1.0 + _FALL_HALF_WIDTH) * middle, distance
             )
-            weighted_sum += weight * wp.vec2(share + (1.0 - share) * nearness, 1.0)
+            weighted_sum += weight * wp.vec2(cell_transmittance + (1.0 - cell_transmittance) * nearness, 1.0)
         weighted_sums[batch, receiver, i] = weighted_sum
 
 

@@ -69,7 +69,7 @@ def _nearest_edge_adjoint(
 
 
 @wp.func
-def _covered_share(
+def _blocked_share(
     grid: PlaneGrid,
     edges: wp.array(dtype=wp.vec4),
     origin: wp.vec3,
@@ -93,7 +93,7 @@ def _covered_share(
     reach = wp.max(sunk * disc_radius * wp.sqrt(wp.max(1.0 - cosine * cosine, 1.0e-6)), margin)
     end_height = wp.where(height < 0.0, -height - rise, height + rise)
     share_beyond = 1.0 - wp.smoothstep(-1.0, 1.0, (end_height + 2.0 * margin) / reach)
-    share = float(0.0)
+    blocked_share = float(0.0)
     if height != 0.0 and share_beyond > 0.0:
         height_change = wp.max(wp.abs(rise), reach)
         position = float(1.0)
@@ -109,8 +109,8 @@ def _covered_share(
         slope = (outward[0] * wp.dot(beam, axis_u) + outward[1] * wp.dot(beam, axis_v)) / (scale * height_change)
         width = wp.max(disc_radius * position, _MIN_WIDTH * distance) * wp.sqrt(1.0 + slope * slope)
         signed_distance = wp.where(number > 0, 1.0, -1.0) * scale * wp.length(gap)
-        share = share_beyond * wp.smoothstep(-1.0, 1.0, signed_distance / width)
-    return share
+        blocked_share = share_beyond * wp.smoothstep(-1.0, 1.0, signed_distance / width)
+    return blocked_share
 
 
 @wp.kernel
@@ -151,9 +151,9 @@ def _block_by_planes(
                 area = sample_areas[sample_batch, first_sample + i]
                 beam = sample_points[sample_batch, first_sample + i] - point
                 if may_light(beam, area, normal, is_two_sided):
-                    share = _covered_share(grid, edges, origin, axis_u, axis_v, side, point, beam, area)
-                    if share > 0.0:
-                        wp.atomic_add(log_transmittances, batch, receiver, i, log_transmittance(share))
+                    blocked_share = _blocked_share(grid, edges, origin, axis_u, axis_v, side, point, beam, area)
+                    if blocked_share > 0.0:
+                        wp.atomic_add(log_transmittances, batch, receiver, i, log_transmittance(blocked_share))
 
 
 def find_log_transmittance_of_planes(

@@ -90,7 +90,7 @@ def find_sample_weights(
     is_used = labels >= 0
     labels, owners, vectors = labels[is_used], pieces.faces[is_used], piece_vectors[is_used]
     areas, patch_count = np.linalg.norm(vectors, axis=1), int(labels.max(initial=-1)) + 1
-    shares = np.abs(np.linalg.det(pieces.corners[is_used].astype(np.float64)))
+    piece_shares = np.abs(np.linalg.det(pieces.corners[is_used].astype(np.float64)))
     sums = np.zeros((patch_count, 4))
     np.add.at(sums, labels, np.column_stack([vectors, areas]))
     stretch = np.minimum(sums[:, 3] / np.maximum(np.linalg.norm(sums[:, :3], axis=1), 1e-30), _MAX_STRETCH)
@@ -101,7 +101,7 @@ def find_sample_weights(
     softness = np.sqrt(3 * np.maximum(stretch - 1, 0))
     softness[softness > _MAX_SOFTNESS] = 0
     of_faces = diags(stretch / (1 + softness**2 / 3)) @ csr_matrix(
-        (shares, (labels, owners)), shape=(patch_count, len(faces))
+        (piece_shares, (labels, owners)), shape=(patch_count, len(faces))
     )
     permutation = compact_order(of_vertices @ positions.astype(np.float64), runs=(SAMPLE_BUNDLE,))
     padding = np.full(-patch_count % SAMPLE_BUNDLE, permutation[-1] if patch_count else 0)
@@ -158,9 +158,9 @@ def _find_surface_points(
     sums = np.cumsum(areas[permutation])
     ends = sums[np.searchsorted(labels[permutation], np.arange(labels.max(initial=-1) + 1), side="right") - 1]
     starts = np.concatenate([[0.0], ends[:-1]])
-    shares = (np.arange(SURFACE_POINTS) + 0.5) / SURFACE_POINTS
+    quantiles = (np.arange(SURFACE_POINTS) + 0.5) / SURFACE_POINTS
     pieces = permutation[
-        np.minimum(np.searchsorted(sums, starts[:, None] + shares * (ends - starts)[:, None]), len(sums) - 1)
+        np.minimum(np.searchsorted(sums, starts[:, None] + quantiles * (ends - starts)[:, None]), len(sums) - 1)
     ]
     u, v = np.random.default_rng(0).uniform(size=(2, *pieces.shape, 1))
     in_pieces = np.concatenate([1 - np.sqrt(u), np.sqrt(u) * (1 - v), np.sqrt(u) * v], axis=-1)
@@ -340,8 +340,8 @@ def facing_area(beam: wp.vec3, area: wp.vec3, softness: float, is_two_sided: int
 def _soft_positive(value: float, width: float):
     """The maximum of a value and 0, soft where it is closer to 0 than a width."""
     if wp.abs(value) < width:
-        share = (value / width + 1.0) / 2.0
-        return width * share * share
+        step = (value / width + 1.0) / 2.0
+        return width * step * step
     return wp.max(value, 0.0)
 
 
@@ -360,10 +360,10 @@ def may_light(beam: wp.vec3, area: wp.vec3, normal: wp.vec3, is_two_sided: int):
 @wp.func
 def sample_transmittance(transmittance: wp.array3d(dtype=wp.float32), batch: int, receiver: int, i: int):
     """Transmittance from a receiver to a sample, 1 where nothing blocks."""
-    through = float(1.0)
+    result = float(1.0)
     if transmittance:
-        through = transmittance[batch, receiver, i]
-    return through
+        result = transmittance[batch, receiver, i]
+    return result
 
 
 def place_samples(positions: wp.array, samples: EmitterSamples) -> PlacedSamples:

@@ -9,7 +9,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.parallel import run_dimensions, run_length, split_launch
 from warpshadow.stages.emitters.samples import PlacedSamples
-from warpshadow.stages.emitters.spot_cones import beam_share
+from warpshadow.stages.emitters.spot_cones import spot_falloff
 from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.raster.project import eye_position
 from warpshadow.stages.raster.rasterization import Fragments
@@ -52,7 +52,7 @@ def _show_beams(
         if emitter >= 0:
             point = interpolate_at(positions[body_batch], faces[face], barycentrics[fragment_batch, sample])
             axis = wp.normalize(axes[instance_in(batch, axes.shape[0]), emitter])
-            shown[batch, sample] = beam_share(axis, eye - point, beams[emitter]) * radiance
+            shown[batch, sample] = spot_falloff(axis, eye - point, beams[emitter]) * radiance
         else:
             shown[batch, sample] = radiance
 

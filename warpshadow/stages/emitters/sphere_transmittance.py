@@ -29,9 +29,9 @@ wp.set_module_options({"max_unroll": 1})
 
 
 @wp.func
-def log_transmittance(share: float):
+def log_transmittance(blocked_share: float):
     """Logarithm of the light that a blocker of a share leaves, of a beam."""
-    return wp.log(wp.max(1.0 - share, MIN_TRANSMITTANCE))
+    return wp.log(wp.max(1.0 - blocked_share, MIN_TRANSMITTANCE))
 
 
 @wp.func
@@ -48,10 +48,10 @@ def _blocked_share(offset: wp.vec3, beam: wp.vec3, disc_radius: float, radius: f
     low = wp.max(middle - width, 0.0)
     mean = 0.5 * (high + low)
     opacity = wp.min(radius * radius / (mean * mean + 0.05 * (high - low) * (high - low)), 1.0)
-    share = opacity * wp.smoothstep(0.0, 1.0, (high - wp.length(offset - depth * direction)) / (high - low))
+    blocked_share = opacity * wp.smoothstep(0.0, 1.0, (high - wp.length(offset - depth * direction)) / (high - low))
     in_front = wp.smoothstep(0.0, 1.0, depth / radius + 0.5)
     is_between = wp.smoothstep(0.0, 1.0, (distance - depth) / radius + 0.5)
-    return share * in_front * is_between
+    return blocked_share * in_front * is_between
 
 
 @wp.func
@@ -115,12 +115,12 @@ def _block_by_spheres(
                     for i in range(SAMPLE_BUNDLE):
                         area = sample_areas[sample_batch, first + i]
                         beam = sample_points[sample_batch, first + i] - point
-                        share = float(0.0)
+                        blocked_share = float(0.0)
                         if may_light(beam, area, normal, is_two_sided):
-                            share = _blocked_share(offset, beam, sample_radius(area), radius)
-                        if share > 0.0:
+                            blocked_share = _blocked_share(offset, beam, sample_radius(area), radius)
+                        if blocked_share > 0.0:
                             index = bundle * SAMPLE_BUNDLE + i
-                            wp.atomic_add(log_transmittances, batch, receiver, index, log_transmittance(share))
+                            wp.atomic_add(log_transmittances, batch, receiver, index, log_transmittance(blocked_share))
 
 
 def find_log_transmittance(

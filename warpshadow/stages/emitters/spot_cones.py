@@ -57,13 +57,13 @@ def find_axis_weights(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndar
 
 
 @wp.func
-def beam_share(axis: wp.vec3, to_receiver: wp.vec3, beam: wp.vec2):
+def spot_falloff(axis: wp.vec3, to_receiver: wp.vec3, beam: wp.vec2):
     """Part of its emission that an emitter sends towards a receiver, given its axis, of length 1, and the way there."""
     return wp.smoothstep(beam[1], beam[0], 0.5 * wp.length_sq(wp.normalize(to_receiver) - axis))
 
 
 @wp.kernel
-def _find_shares(
+def _dim_by_beam(
     first_row: int,
     worker: int,
     # in
@@ -75,16 +75,16 @@ def _find_shares(
     first_sample: int,
     beam: wp.vec2,
     # out
-    shares: wp.array3d(dtype=wp.float32),
+    dimmed: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver of an instance."""
-    batch, receiver = split_row(first_row + wp.tid(), shares.shape[1])
+    batch, receiver = split_row(first_row + wp.tid(), dimmed.shape[1])
     point = points[batch, receiver]
     sample_batch = instance_in(batch, sample_points.shape[0])
     axis = wp.normalize(axes[sample_batch, emitter])
-    for i in range(shares.shape[2]):
-        share = beam_share(axis, point - sample_points[sample_batch, first_sample + i], beam)
-        shares[batch, receiver, i] = share * sample_transmittance(transmittance, batch, receiver, i)
+    for i in range(dimmed.shape[2]):
+        falloff = spot_falloff(axis, point - sample_points[sample_batch, first_sample + i], beam)
+        dimmed[batch, receiver, i] = falloff * sample_transmittance(transmittance, batch, receiver, i)
 
 
 def weigh_by_beam(
@@ -102,17 +102,17 @@ def weigh_by_beam(
     if span.beam is None:
         return transmittance
     count = common_batch({"points": points, "emitters": samples.points, "transmittance": transmittance})
-    shares = empty((count, points.shape[1], span.size), dtype=wp.float32, device=points.device)
+    dimmed = empty((count, points.shape[1], span.size), dtype=wp.float32, device=points.device)
     launch(
-        _find_shares,
+        _dim_by_beam,
         count * points.shape[1],
         inputs=[
             *(expand(points, count), samples.points, samples.axes),
             None if transmittance is None else expand_rows(transmittance, count),
             *(span.emitter, span.first, wp.vec2(*span.beam)),
         ],
-        outputs=[shares],
+        outputs=[dimmed],
         shared=[samples.points, samples.axes],
         cost=_COST * span.size,
     )
-    return shares
+    return dimmed

@@ -18,7 +18,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.adjacency import area_normals
 from warpshadow.stages.emitters.samples import SURFACE_POINTS, EmitterSamples, EmitterSpan, may_light
-from warpshadow.stages.emitters.spot_cones import beam_share
+from warpshadow.stages.emitters.spot_cones import spot_falloff
 from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.rays.ray_tracing import RAY_COST, mesh_id, progress_slices, sees_point
 from warpshadow.stages.textures.pyramid import Textures
@@ -125,10 +125,10 @@ def _mean_radiance(textures: EmissionTextures) -> np.ndarray:
 
 @wp.func
 def light_of_point(
-    emitters: EmittingFaces, mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, share: float, u: float, v: float
+    emitters: EmittingFaces, mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, choice: float, u: float, v: float
 ):
     """Light of a point of the emitters on a receiver over the point's density, given three numbers even in [0, 1)."""
-    index = wp.lower_bound(emitters.distribution, share)
+    index = wp.lower_bound(emitters.distribution, choice)
     index = wp.min(index, emitters.distribution.shape[0] - 1)
     probability = emitters.distribution[index]
     if index > 0:
@@ -158,7 +158,7 @@ def light_of_point(
         light = cosine * (facing_area / (distance * distance)) / (wp.pi * probability) * radiance
         if emitters.axes.shape[0] > 0:
             axis = wp.normalize(emitters.axes[index])
-            light = beam_share(axis, -ray_direction, emitters.beams[index]) * light
+            light = spot_falloff(axis, -ray_direction, emitters.beams[index]) * light
     return light
 
 
@@ -241,10 +241,10 @@ def _trace_transmittance(
                 total_weight += facing
                 if sees_point(mesh, point, normal, wp.normalize(beam), wp.length(beam)):
                     open_weight += facing
-        share = float(0.0)
+        open_share = float(0.0)
         if total_weight > 0.0:
-            share = open_weight / total_weight
-        transmittance[receiver, i] = share
+            open_share = open_weight / total_weight
+        transmittance[receiver, i] = open_share
 
 
 def trace_transmittance(

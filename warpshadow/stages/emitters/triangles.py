@@ -27,8 +27,8 @@ def _cut(a: wp.vec3, b: wp.vec3, normal: wp.vec3):
     height = wp.dot(a, normal)
     other = wp.dot(b, normal)
     rises = height < 0.0 and other > 0.0
-    share = wp.where(rises, height, 0.0) / wp.where(rises, height - other, 1.0)
-    return a + share * (b - a)
+    edge_share = wp.where(rises, height, 0.0) / wp.where(rises, height - other, 1.0)
+    return a + edge_share * (b - a)
 
 
 @wp.func

@@ -55,7 +55,7 @@ def _sum_spreads(
     # in
     item_starts: wp.array(dtype=wp.int32),
     vertices: wp.array(dtype=wp.int32),
-    shares: wp.array(dtype=wp.float32),
+    spread_weights: wp.array(dtype=wp.float32),
     positions: wp.array2d(dtype=wp.vec3),
     centers: wp.array2d(dtype=wp.vec3),
     # out
@@ -67,7 +67,7 @@ def _sum_spreads(
     center = centers[instance_in(instance, centers.shape[0]), sphere]
     total = float(0.0)
     for item in range(item_starts[sphere], item_starts[sphere + 1]):
-        total += shares[item] * wp.length_sq(positions[position_batch, vertices[item]] - center)
+        total += spread_weights[item] * wp.length_sq(positions[position_batch, vertices[item]] - center)
     spreads[instance, sphere] = total
 
 
@@ -96,7 +96,7 @@ class SphereBinding:
     item_starts: wp.array  # where the items of each sphere begin, and the end of the last, int32 of shape [sphere + 1]
     vertices: wp.array  # of each item, int32 of shape [item]
     weights: wp.array  # w, by which centers follow, float32 of shape [item]
-    shares: wp.array  # a, whose sum is 1 for each sphere, float32 of shape [item]
+    spread_weights: wp.array  # a, whose sum is 1 for each sphere, float32 of shape [item]
 
     @staticmethod
     def bind(
@@ -120,12 +120,12 @@ class SphereBinding:
             _weights(candidate_positions[bound_vertices], *sphere)
             for bound_vertices, *sphere in zip(bound_items, centers, binding_radii, strict=True)
         ]
-        weights, shares = (np.concatenate(column) for column in zip(*rows, strict=True))
+        weights, spread_weights = (np.concatenate(column) for column in zip(*rows, strict=True))
         return SphereBinding(
             wp.array(np.cumsum([0, *map(len, bound_items)]), dtype=wp.int32, device=device),
             wp.array(vertices[np.concatenate(bound_items)], dtype=wp.int32, device=device),
             wp.array(weights, dtype=wp.float32, device=device),
-            wp.array(shares, dtype=wp.float32, device=device),
+            wp.array(spread_weights, dtype=wp.float32, device=device),
         )
 
     def moved(
@@ -160,7 +160,7 @@ class SphereBinding:
         """Mean square distances of vertices from centers, float32 of shape [batch, sphere]."""
         shape = max(len(positions), len(centers)), centers.shape[1]
         spreads = empty(shape, dtype=wp.float32, device=positions.device)
-        inputs = [self.item_starts, self.vertices, self.shares, positions, centers]
+        inputs = [self.item_starts, self.vertices, self.spread_weights, positions, centers]
         launch(_sum_spreads, shape, inputs=inputs, outputs=[spreads])
         return spreads
 
@@ -168,11 +168,11 @@ class SphereBinding:
 def _weights(
     candidate_positions: np.ndarray, center: np.ndarray, binding_radius: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Weights and shares of vertices [vertex, 3] around a center."""
-    shares = (1.0 - ((candidate_positions - center) ** 2).sum(axis=1) / binding_radius**2).clip(0.0) ** 2
-    shares /= shares.sum()
-    mean = shares @ candidate_positions
+    """Weights w and a of vertices [vertex, 3] around a center."""
+    spread_weights = (1.0 - ((candidate_positions - center) ** 2).sum(axis=1) / binding_radius**2).clip(0.0) ** 2
+    spread_weights /= spread_weights.sum()
+    mean = spread_weights @ candidate_positions
     offsets = candidate_positions - mean
-    spread = (shares[:, None] * offsets).T @ offsets
+    spread = (spread_weights[:, None] * offsets).T @ offsets
     slopes = np.linalg.solve(spread + (_RIDGE * np.trace(spread) + 1e-30) * np.eye(3), center - mean)
-    return shares * (1.0 + offsets @ slopes), shares
+    return spread_weights * (1.0 + offsets @ slopes), spread_weights

@@ -42,7 +42,7 @@ def _weigh_by_faces(
     row, sample = wp.tid()
     batch, receiver = split_row(first_row + row, weighed.shape[1])
     weights = filters[batch, receiver, sample]
-    share = float(1.0)
+    above_face = float(1.0)
     face = face_ids[instance_in(batch, face_ids.shape[0]), receiver]
     if face >= 0:
         corners = faces[face]
@@ -54,8 +54,8 @@ def _weigh_by_faces(
         face_normal = wp.normalize(wp.cross(wp.normalize(b - a), wp.normalize(c - a)))
         side = wp.dot(face_normal, normals[instance_in(batch, normals.shape[0]), receiver])
         height = wp.dot(face_normal, directions[batch, receiver, sample]) * wp.where(side < 0.0, -1.0, 1.0)
-        share = wp.smoothstep(-_DEPTH, 0.0, height)
-    weighed[batch, receiver, sample] = wp.vec3(share * weights[0], share * weights[1], weights[2])
+        above_face = wp.smoothstep(-_DEPTH, 0.0, height)
+    weighed[batch, receiver, sample] = wp.vec3(above_face * weights[0], above_face * weights[1], weights[2])
 
 
 def weigh_by_faces(

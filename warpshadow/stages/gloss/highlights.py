@@ -55,11 +55,11 @@ def _sum_highlights(
     is_two_sided: int,
     transmittance: wp.array3d(dtype=wp.float32),
     # out
-    straight: wp.array2d(dtype=wp.vec3),
-    grazing: wp.array2d(dtype=wp.vec3),
+    light_f0: wp.array2d(dtype=wp.vec3),
+    light_f90: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver of an instance: G and G'."""
-    batch, receiver = split_row(first_row + wp.tid(), straight.shape[1])
+    batch, receiver = split_row(first_row + wp.tid(), light_f0.shape[1])
     point = points[batch, receiver]
     normal = normals[batch, receiver]
     eye = eye_position(clip_matrices[instance_in(batch, clip_matrices.shape[0])])
@@ -68,8 +68,8 @@ def _sum_highlights(
     rough = wp.max(roughness[instance_in(batch, roughness.shape[0]), receiver], MIN_ROUGHNESS)
     sample_batch = instance_in(batch, sample_points.shape[0])
     radiance_batch = instance_in(batch, radiance.shape[0])
-    straight_sum = wp.vec3()
-    grazing_sum = wp.vec3()
+    sum_f0 = wp.vec3()
+    sum_f90 = wp.vec3()
     for i in range(sample_count):
         beam = sample_points[sample_batch, first_sample + i] - point
         area = sample_areas[sample_batch, first_sample + i]
@@ -86,10 +86,10 @@ def _sum_highlights(
             weight = weight * _reflect(wp.dot(normal, mirror), cosine, view_cosine, square)
             base = wp.max(1.0 - wp.dot(view, mirror), 0.0)
             light = weight * radiance[radiance_batch, first_sample + i]
-            straight_sum += light
-            grazing_sum += base * base * base * base * base * light
-    straight[batch, receiver] = straight_sum
-    grazing[batch, receiver] = grazing_sum
+            sum_f0 += light
+            sum_f90 += base * base * base * base * base * light
+    light_f0[batch, receiver] = sum_f0
+    light_f90[batch, receiver] = sum_f90
 
 
 def sum_highlights(

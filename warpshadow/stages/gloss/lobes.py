@@ -130,11 +130,11 @@ def _shape_lobes(
     trace = wp.sqrt(square_xx + square_yy + 2.0 * determinant)  # of W
     width = wp.vec3(square_xx + determinant, square_xy, square_yy + determinant) / trace
     stretched_view = wp.vec3(width[0] * sine, width[1] * sine, cosine)
-    slant = wp.length(stretched_view)
+    smith_lambda = wp.length(stretched_view)
     lobe_normals[batch, receiver] = normal
     tangents[batch, receiver] = tangent
-    view_terms[batch, receiver] = wp.vec3(sine, cosine, slant)
-    cap_axes[batch, receiver] = stretched_view / slant
+    view_terms[batch, receiver] = wp.vec3(sine, cosine, smith_lambda)
+    cap_axes[batch, receiver] = stretched_view / smith_lambda
     widths[batch, receiver] = width
     cosines[batch, receiver] = cosine
 
@@ -210,9 +210,9 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         tangent = tangents[batch, receiver]
         bitangent = wp.cross(normal, tangent)
         view = view_terms[batch, receiver]
-        sine, cosine, slant = view[0], view[1], view[2]
+        sine, cosine, smith_lambda = view[0], view[1], view[2]
         width = widths[batch, receiver]
-        weight_scale = (cosine + slant) / float(directions.shape[2])
+        weight_scale = (cosine + smith_lambda) / float(directions.shape[2])
         blur_scale = blur_share * wp.sqrt(weight_scale * (width[0] * width[2] - width[1] * width[1]))
         place = int(0)
         if places:
@@ -239,17 +239,17 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             direction_z = tangent[2] * x + bitangent[2] * y + normal[2] * z
             up = wp.max(z, Lane(0.0))
             spread_x, spread_y = stretch(width, x, y)
-            reflected_slant = sqrt(wp.cw_mul(spread_x, spread_x) + wp.cw_mul(spread_y, spread_y) + wp.cw_mul(up, up))
-            weight = wp.cw_div(weight_scale * up, slant * up + cosine * reflected_slant)
-            grazing_base = wp.max(Lane(1.0) - view_cosine, Lane(0.0))
-            grazing_square = wp.cw_mul(grazing_base, grazing_base)
-            grazing = wp.cw_mul(weight, wp.cw_mul(wp.cw_mul(grazing_square, grazing_square), grazing_base))
+            reflected_lambda = sqrt(wp.cw_mul(spread_x, spread_x) + wp.cw_mul(spread_y, spread_y) + wp.cw_mul(up, up))
+            weight = wp.cw_div(weight_scale * up, smith_lambda * up + cosine * reflected_lambda)
+            fresnel_base = wp.max(Lane(1.0) - view_cosine, Lane(0.0))
+            fresnel_square = wp.cw_mul(fresnel_base, fresnel_base)
+            weight_f90 = wp.cw_mul(weight, wp.cw_mul(wp.cw_mul(fresnel_square, fresnel_square), fresnel_base))
             first = block * lanes
             for lane in range(wp.min(lanes, directions.shape[2] - first)):
                 directions[batch, receiver, first + lane] = wp.vec3(
                     direction_x[lane], direction_y[lane], direction_z[lane]
                 )
-                filters[batch, receiver, first + lane] = wp.vec3(weight[lane], grazing[lane], blur[lane])
+                filters[batch, receiver, first + lane] = wp.vec3(weight[lane], weight_f90[lane], blur[lane])
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def sample_lobes_adjoint(
@@ -279,14 +279,14 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         tangent = tangents[batch, receiver]
         bitangent = wp.cross(normal, tangent)
         view = view_terms[batch, receiver]
-        sine, cosine, slant = view[0], view[1], view[2]
+        sine, cosine, smith_lambda = view[0], view[1], view[2]
         width = widths[batch, receiver]
-        weight_scale = (cosine + slant) / float(adj_directions.shape[2])
+        weight_scale = (cosine + smith_lambda) / float(adj_directions.shape[2])
         determinant = width[0] * width[2] - width[1] * width[1]
         blur_scale = blur_share * wp.sqrt(weight_scale * determinant)
         adj_sine = Lane(0.0)
         adj_cosine = Lane(0.0)
-        adj_slant = Lane(0.0)
+        adj_smith_lambda = Lane(0.0)
         adj_weight_scale = Lane(0.0)
         adj_blur_scale = Lane(0.0)
         adj_width_xx = Lane(0.0)
@@ -318,26 +318,26 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             z = 2.0 * wp.cw_mul(view_cosine, mirror.z) - Lane(cosine)
             up = wp.max(z, Lane(0.0))
             spread_x, spread_y = stretch(width, x, y)
-            reflected_slant = sqrt(wp.cw_mul(spread_x, spread_x) + wp.cw_mul(spread_y, spread_y) + wp.cw_mul(up, up))
-            denominator = slant * up + cosine * reflected_slant
+            reflected_lambda = sqrt(wp.cw_mul(spread_x, spread_x) + wp.cw_mul(spread_y, spread_y) + wp.cw_mul(up, up))
+            denominator = smith_lambda * up + cosine * reflected_lambda
             weight = wp.cw_div(weight_scale * up, denominator)
-            grazing_base = wp.max(Lane(1.0) - view_cosine, Lane(0.0))
-            grazing_square = wp.cw_mul(grazing_base, grazing_base)
-            grazing_fourth = wp.cw_mul(grazing_square, grazing_square)
+            fresnel_base = wp.max(Lane(1.0) - view_cosine, Lane(0.0))
+            fresnel_square = wp.cw_mul(fresnel_base, fresnel_base)
+            fresnel_fourth = wp.cw_mul(fresnel_square, fresnel_square)
 
             adj_direction = load_or_zero(adj_directions[batch, receiver], block * lanes)
             adj_filter = load_or_zero(adj_filters[batch, receiver], block * lanes)
-            adj_weight = adj_filter.x + wp.cw_mul(adj_filter.y, wp.cw_mul(grazing_fourth, grazing_base))
-            adj_view_cosine = -5.0 * wp.cw_mul(wp.cw_mul(adj_filter.y, weight), grazing_fourth)
+            adj_weight = adj_filter.x + wp.cw_mul(adj_filter.y, wp.cw_mul(fresnel_fourth, fresnel_base))
+            adj_view_cosine = -5.0 * wp.cw_mul(wp.cw_mul(adj_filter.y, weight), fresnel_fourth)
             adj_ratio = wp.cw_div(adj_weight, denominator)
             adj_weight_scale += wp.cw_mul(adj_ratio, up)
             adj_denominator = -1.0 * wp.cw_mul(adj_ratio, weight)
-            adj_slant += wp.cw_mul(adj_denominator, up)
-            adj_cosine += wp.cw_mul(adj_denominator, reflected_slant)
-            adj_square = wp.cw_div(cosine * adj_denominator, reflected_slant)
+            adj_smith_lambda += wp.cw_mul(adj_denominator, up)
+            adj_cosine += wp.cw_mul(adj_denominator, reflected_lambda)
+            adj_square = wp.cw_div(cosine * adj_denominator, reflected_lambda)
             adj_spread_x = wp.cw_mul(adj_square, spread_x)
             adj_spread_y = wp.cw_mul(adj_square, spread_y)
-            adj_up = weight_scale * adj_ratio + slant * adj_denominator + wp.cw_mul(adj_square, up)
+            adj_up = weight_scale * adj_ratio + smith_lambda * adj_denominator + wp.cw_mul(adj_square, up)
             adj_x, adj_y = stretch(width, adj_spread_x, adj_spread_y)
             adj_x += dot_direction(tangent, adj_direction)
             adj_y += dot_direction(bitangent, adj_direction)
@@ -378,12 +378,12 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             adj_axis_z += wp.cw_mul(adj_cap_z, Lane(1.0) - height_share) - wp.cw_mul(adj_height, height_share)
         scale_rate = total(adj_weight_scale) / float(adj_directions.shape[2])
         blur_rate = 0.5 * blur_scale * total(adj_blur_scale)
-        scale_rate += blur_rate / (cosine + slant)
+        scale_rate += blur_rate / (cosine + smith_lambda)
         blur_rate = blur_rate / determinant
         adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal + wp.cross(tangent, adj_bitangent)
         adj_tangents[batch, receiver] = adj_tangents[batch, receiver] + adj_tangent + wp.cross(adj_bitangent, normal)
         adj_views[batch, receiver] = adj_views[batch, receiver] + wp.vec3(
-            total(adj_sine), total(adj_cosine) + scale_rate, total(adj_slant) + scale_rate
+            total(adj_sine), total(adj_cosine) + scale_rate, total(adj_smith_lambda) + scale_rate
         )
         adj_caps[batch, receiver] = adj_caps[batch, receiver] + total_vector(adj_axis_x, adj_axis_y, adj_axis_z)
         adj_widths[batch, receiver] = (

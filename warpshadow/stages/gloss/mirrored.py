@@ -48,7 +48,7 @@ def _mirror(
     batch, receiver = split_row(first_row + row, mirrored.shape[1])
     direction = directions[instance_in(batch, directions.shape[0]), receiver, sample]
     blur = filters[instance_in(batch, filters.shape[0]), receiver, sample][2]
-    grazing = float(0.0)
+    fresnel_weight = float(0.0)
     hit_batch = instance_in(batch, face_ids.shape[0])
     face = face_ids[hit_batch, receiver, sample]
     if face >= 0:
@@ -59,11 +59,11 @@ def _mirror(
         width = width * width
         blur = wp.sqrt(blur * blur + 2.0 * width * width)
         cosine = wp.dot(normal, direction)
-        slant = 1.0 - wp.min(wp.abs(cosine), 1.0)
-        grazing = slant * slant * slant * slant * slant
+        fresnel_base = 1.0 - wp.min(wp.abs(cosine), 1.0)
+        fresnel_weight = fresnel_base * fresnel_base * fresnel_base * fresnel_base * fresnel_base
         direction = direction - 2.0 * cosine * normal
     mirrored[batch, receiver, sample] = direction
-    mirrored_filters[batch, receiver, sample] = wp.vec3(grazing, 0.0, blur)
+    mirrored_filters[batch, receiver, sample] = wp.vec3(fresnel_weight, 0.0, blur)
 
 
 class MirroredDirections(NamedTuple):
@@ -134,18 +134,18 @@ def _mix_mirrored(
     if face >= 0:
         weights = barycentrics[hit_batch, receiver, sample]
         color = interpolate_at(albedo[instance_in(batch, albedo.shape[0])], faces[face], weights)
-        share = interpolate_at(metallic[instance_in(batch, metallic.shape[0])], faces[face], weights)
-        grazing = filters[instance_in(batch, filters.shape[0]), receiver, sample][0]
+        metal_share = interpolate_at(metallic[instance_in(batch, metallic.shape[0])], faces[face], weights)
+        fresnel_weight = filters[instance_in(batch, filters.shape[0]), receiver, sample][0]
         seen = mean
         if last_ray == MEETS_SKY:
             seen = light[instance_in(batch, light.shape[0]), receiver, sample]
         if last_ray == LEAVES_BELOW:
             seen = wp.vec3()
-        fresnel = color + grazing * (wp.vec3(1.0) - color)
+        fresnel = color + fresnel_weight * (wp.vec3(1.0) - color)
         diffuse = mean
         if radiosity:
             diffuse = radiosity[instance_in(batch, radiosity.shape[0]), face]
-        result = blocked * (share * wp.cw_mul(fresnel, seen) + (1.0 - share) * diffuse - mean)
+        result = blocked * (metal_share * wp.cw_mul(fresnel, seen) + (1.0 - metal_share) * diffuse - mean)
     radiance[batch, receiver, sample] = result
 
 

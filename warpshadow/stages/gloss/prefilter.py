@@ -262,18 +262,18 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
                 blur = filters[batch, receiver, first + lane][2]
                 height = _find_height(blur, texels_per_radian)
                 level = int(height)
-                share = height - float(level)
+                upper_share = height - float(level)
                 lower = _find_place(levels[level][0], levels[level][1], half_turns[lane], turns[lane])
                 upper = _find_place(levels[level + 1][0], levels[level + 1][1], half_turns[lane], turns[lane])
                 if adj_texels:
-                    _add_to_texels((1.0 - share) * adj, lower, adj_texels[texel_batch])
-                    _add_to_texels(share * adj, upper, adj_texels[texel_batch])
+                    _add_to_texels((1.0 - upper_share) * adj, lower, adj_texels[texel_batch])
+                    _add_to_texels(upper_share * adj, upper, adj_texels[texel_batch])
                 sharp = _slopes(light_texels, lower, adj)
                 soft = _slopes(light_texels, upper, adj)
                 rows = float(levels[level][1]) / wp.pi
                 blurred_rows = float(levels[level + 1][1]) / wp.pi
-                adj_polar[lane] = (1.0 - share) * rows * sharp[1] + share * blurred_rows * soft[1]
-                adj_azimuth[lane] = (1.0 - share) * rows * sharp[2] + share * blurred_rows * soft[2]
+                adj_polar[lane] = (1.0 - upper_share) * rows * sharp[1] + upper_share * blurred_rows * soft[1]
+                adj_azimuth[lane] = (1.0 - upper_share) * rows * sharp[2] + upper_share * blurred_rows * soft[2]
                 if adj_filters and height > 0.0 and height < float(_LEVELS) - 1.001:
                     adj_blur = (soft[0] - sharp[0]) / (blur * wp.log(2.0))
                     adj_filters[batch, receiver, first + lane] = adj_filters[batch, receiver, first + lane] + wp.vec3(

@@ -46,37 +46,37 @@ def _sum_lobes(
     blocked_light: wp.array2d(dtype=wp.vec3),
     mirrored_light: wp.array3d(dtype=wp.vec3),
     # out
-    straight: wp.array2d(dtype=wp.vec3),
-    grazing: wp.array2d(dtype=wp.vec3),
+    light_f0: wp.array2d(dtype=wp.vec3),
+    light_f90: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver: G and G'."""
-    batch, receiver = split_row(first_row + wp.tid(), straight.shape[1])
+    batch, receiver = split_row(first_row + wp.tid(), light_f0.shape[1])
     filter_batch = instance_in(batch, filters.shape[0])
     light_batch = instance_in(batch, light.shape[0])
     transmittance_batch = instance_in(batch, transmittance.shape[0])
     blocked_batch = instance_in(batch, blocked_light.shape[0])
     mirrored_batch = instance_in(batch, mirrored_light.shape[0])
-    straight_sum = wp.vec3()
-    grazing_sum = wp.vec3()
+    sum_f0 = wp.vec3()
+    sum_f90 = wp.vec3()
     for i in range(filters.shape[2]):
         weight = filters[filter_batch, receiver, i]
-        share = transmittance[transmittance_batch, receiver, i]
-        radiance = share * light[light_batch, receiver, i]
+        open_share = transmittance[transmittance_batch, receiver, i]
+        radiance = open_share * light[light_batch, receiver, i]
         if blocked_light:
-            radiance += (1.0 - share) * blocked_light[blocked_batch, receiver]
+            radiance += (1.0 - open_share) * blocked_light[blocked_batch, receiver]
         if mirrored_light:
             radiance += mirrored_light[mirrored_batch, receiver, i]
-        straight_sum += weight[0] * radiance
-        grazing_sum += weight[1] * radiance
-    straight[batch, receiver] = straight_sum
-    grazing[batch, receiver] = grazing_sum
+        sum_f0 += weight[0] * radiance
+        sum_f90 += weight[1] * radiance
+    light_f0[batch, receiver] = sum_f0
+    light_f90[batch, receiver] = sum_f90
 
 
 class LobeLight(NamedTuple):
     """Light in the lobes of receivers, vec3 of shape [batch, receiver]."""
 
-    straight: wp.array  # G
-    grazing: wp.array  # G'
+    light_f0: wp.array  # G
+    light_f90: wp.array  # G'
 
 
 def sum_lobes(
@@ -126,8 +126,8 @@ def _find_blocked_radiance(
     batch, receiver = wp.tid()
     light = bounced_light[instance_in(batch, bounced_light.shape[0]), receiver]
     indirect_light = light - direct[instance_in(batch, direct.shape[0]), receiver]
-    share = 1.0 - openness[instance_in(batch, openness.shape[0]), receiver][0]
-    blocked_light[batch, receiver] = wp.max(indirect_light, wp.vec3()) / wp.max(share, MIN_BLOCKED_SHARE)
+    blocked_share = 1.0 - openness[instance_in(batch, openness.shape[0]), receiver][0]
+    blocked_light[batch, receiver] = wp.max(indirect_light, wp.vec3()) / wp.max(blocked_share, MIN_BLOCKED_SHARE)
 
 
 def find_blocked_radiance(bounced_light: wp.array, direct: wp.array, openness: wp.array) -> wp.array:
@@ -173,8 +173,8 @@ def _mix_reflection(
     # in
     receiver_indices: wp.array(dtype=wp.int32),
     diffuse: wp.array2d(dtype=wp.vec3),
-    straight: wp.array2d(dtype=wp.vec3),
-    grazing: wp.array2d(dtype=wp.vec3),
+    light_f0: wp.array2d(dtype=wp.vec3),
+    light_f90: wp.array2d(dtype=wp.vec3),
     cosines: wp.array2d(dtype=wp.float32),
     metallic: wp.array2d(dtype=wp.float32),
     specular: wp.array2d(dtype=wp.float32),
@@ -191,21 +191,19 @@ def _mix_reflection(
         colored_reflection[batch, receiver] = light
         white[batch, receiver] = wp.vec3()
     else:
-        straight_light = straight[instance_in(batch, straight.shape[0]), receiver_index]
-        grazing_light = grazing[instance_in(batch, grazing.shape[0]), receiver_index]
+        lobe_f0 = light_f0[instance_in(batch, light_f0.shape[0]), receiver_index]
+        lobe_f90 = light_f90[instance_in(batch, light_f90.shape[0]), receiver_index]
         m = metallic[instance_in(batch, metallic.shape[0]), receiver_index]
         s = specular[instance_in(batch, specular.shape[0]), receiver_index]
-        slant = 1.0 - cosines[instance_in(batch, cosines.shape[0]), receiver_index]
-        slant = slant * slant
+        complement = 1.0 - cosines[instance_in(batch, cosines.shape[0]), receiver_index]
+        complement = complement * complement
         reflectance = DIELECTRIC_F0 + (1.0 - DIELECTRIC_F0) * (
-            even_coefficients[0] + slant * (even_coefficients[1] + slant * even_coefficients[2])
+            even_coefficients[0] + complement * (even_coefficients[1] + complement * even_coefficients[2])
         )
-        colored_reflection[batch, receiver] = (1.0 - m) * (1.0 - s * reflectance) * light + m * (
-            straight_light - grazing_light
-        )
+        colored_reflection[batch, receiver] = (1.0 - m) * (1.0 - s * reflectance) * light + m * (lobe_f0 - lobe_f90)
         white[batch, receiver] = (1.0 - m) * s * (
-            DIELECTRIC_F0 * straight_light + (1.0 - DIELECTRIC_F0) * grazing_light
-        ) + m * grazing_light
+            DIELECTRIC_F0 * lobe_f0 + (1.0 - DIELECTRIC_F0) * lobe_f90
+        ) + m * lobe_f90
 
 
 @wp.kernel(enable_backward=False)
@@ -250,8 +248,8 @@ class ReflectedLight(NamedTuple):
 def mix_reflection(
     receiver_indices: wp.array,
     diffuse: wp.array,
-    straight: wp.array,
-    grazing: wp.array,
+    light_f0: wp.array,
+    light_f90: wp.array,
     cosines: wp.array,
     metallic: wp.array,
     specular: wp.array,
@@ -261,16 +259,16 @@ def mix_reflection(
     Args:
         receiver_indices: Of each receiver among the glossy ones, −1 for diffuse ones, int32 of shape [receiver].
         diffuse: E, light that receivers would reflect as white diffuse surfaces, vec3 of shape [batch, receiver].
-        straight, grazing: G and G' of the glossy ones, vec3 of shape [batch, glossy].
+        light_f0, light_f90: G and G' of the glossy ones, vec3 of shape [batch, glossy].
         cosines: μ of them, float32 of shape [batch, glossy].
         metallic, specular: m and s of them, float32 of shape [batch, glossy].
 
     Differentiable: all but receiver_indices.
     """
     check.shape("receiver_indices", receiver_indices.shape, diffuse.shape[1:])
-    arrays = {"diffuse": diffuse, "gloss": straight, "cosines": cosines, "metallic": metallic, "specular": specular}
+    arrays = {"diffuse": diffuse, "gloss": light_f0, "cosines": cosines, "metallic": metallic, "specular": specular}
     shape = common_batch(arrays), diffuse.shape[1]
     reflected = ReflectedLight(*(wp.empty(shape, dtype=wp.vec3, device=diffuse.device) for _ in range(2)))
-    inputs = [receiver_indices, diffuse, straight, grazing, cosines, metallic, specular, even_grazing()]
+    inputs = [receiver_indices, diffuse, light_f0, light_f90, cosines, metallic, specular, even_grazing()]
     launch(_mix_reflection, shape, inputs=inputs, outputs=[*reflected])
     return reflected

@@ -114,8 +114,8 @@ def _reflect_disc(view: wp.vec3, width: wp.vec3, direction: wp.vec3, solid_angle
     density = density * 4.0 * view_cosine / (solid_angle * mirror[2])
     spread_x = width[0] * direction[0] + width[1] * direction[1]
     spread_y = width[1] * direction[0] + width[2] * direction[1]
-    slant = wp.sqrt(spread_x * spread_x + spread_y * spread_y + direction[2] * direction[2])
-    weight = 0.5 * density * direction[2] / (direction[2] * view[2] + view[1] * slant)
+    smith_lambda = wp.sqrt(spread_x * spread_x + spread_y * spread_y + direction[2] * direction[2])
+    weight = 0.5 * density * direction[2] / (direction[2] * view[2] + view[1] * smith_lambda)
     base = wp.max(1.0 - view_cosine, 0.0)
     return wp.vec2(weight, weight * base * base * base * base * base)
 
@@ -133,16 +133,16 @@ def _reflect_suns(
     irradiance: wp.array(dtype=wp.vec3),
     solid_angles: wp.array(dtype=wp.float32),
     transmittance: wp.array3d(dtype=wp.float32),
-    straight: wp.array2d(dtype=wp.vec3),
-    grazing: wp.array2d(dtype=wp.vec3),
+    light_f0: wp.array2d(dtype=wp.vec3),
+    light_f90: wp.array2d(dtype=wp.vec3),
     # out
-    straight_sum: wp.array2d(dtype=wp.vec3),
-    grazing_sum: wp.array2d(dtype=wp.vec3),
+    sum_f0: wp.array2d(dtype=wp.vec3),
+    sum_f90: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver: G and G'."""
-    batch, receiver = split_row(first_row + wp.tid(), straight_sum.shape[1])
+    batch, receiver = split_row(first_row + wp.tid(), sum_f0.shape[1])
     lobe_batch = instance_in(batch, normals.shape[0])
-    light_batch = instance_in(batch, straight.shape[0])
+    light_batch = instance_in(batch, light_f0.shape[0])
     normal = normals[lobe_batch, receiver]
     tangent = tangents[lobe_batch, receiver]
     bitangent = wp.cross(normal, tangent)
@@ -150,8 +150,8 @@ def _reflect_suns(
     width = widths[lobe_batch, receiver]
     count = transmittance.shape[2] / directions.shape[0]  # directions of each sun
     transmittance_batch = instance_in(batch, transmittance.shape[0])
-    straight_suns = wp.vec3()
-    grazing_suns = wp.vec3()
+    suns_f0 = wp.vec3()
+    suns_f90 = wp.vec3()
     for i in range(directions.shape[0]):
         cosine = wp.dot(normal, directions[i])
         if cosine > 0.0:
@@ -159,10 +159,10 @@ def _reflect_suns(
             weights = _reflect_disc(view, width, direction, solid_angles[i]) / float(count)
             for k in range(count):
                 light = transmittance[transmittance_batch, receiver, i * count + k] * irradiance[i]
-                straight_suns += weights[0] * light
-                grazing_suns += weights[1] * light
-    straight_sum[batch, receiver] = straight[light_batch, receiver] + straight_suns
-    grazing_sum[batch, receiver] = grazing[light_batch, receiver] + grazing_suns
+                suns_f0 += weights[0] * light
+                suns_f90 += weights[1] * light
+    sum_f0[batch, receiver] = light_f0[light_batch, receiver] + suns_f0
+    sum_f90[batch, receiver] = light_f90[light_batch, receiver] + suns_f90
 
 
 def add_suns(lobe_light: LobeLight, lobes: Lobes, suns: Suns, transmittance: wp.array) -> LobeLight:
@@ -182,8 +182,8 @@ def add_suns(lobe_light: LobeLight, lobes: Lobes, suns: Suns, transmittance: wp.
         return lobe_light
     if transmittance.shape[2] % len(suns.directions):
         raise ValueError(f"transmittance: got {transmittance.shape[2]} directions of {len(suns.directions)} suns")
-    arrays = {"lobe_light": lobe_light.straight, "lobes": lobes.normals, "transmittance": transmittance}
-    count, receiver_count = common_batch(arrays), lobe_light.straight.shape[1]
+    arrays = {"lobe_light": lobe_light.light_f0, "lobes": lobes.normals, "transmittance": transmittance}
+    count, receiver_count = common_batch(arrays), lobe_light.light_f0.shape[1]
     sums = LobeLight(*(empty((count, receiver_count), dtype=wp.vec3, device=device) for _ in range(2)))
     of_lobes = [lobes.normals, lobes.tangents, lobes.view_terms, lobes.widths]
     of_suns = [

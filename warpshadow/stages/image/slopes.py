@@ -1,8 +1,8 @@
 """Slopes: how samples change as surfaces move over the screen, by the mean gradient of color over each sample.
 
-A surface of color c that moves over the screen by v changes a sample by −∇c · v. Here ∇c is its mean over the sample.
-(At the sample's point it would be that of one face, of many where faces are as small as samples, and far from the mean
-towards a limb, where shading changes faster and faster.) To the right of the sample color changes by
+A surface of color c that moves over the screen by v changes a sample by −∇c · v, with ∇c its mean over the sample. (At
+the sample's point ∇c would be that of one face, and far from the mean where shading changes fast, as towards a limb.)
+To the right of the sample color changes by
 
     ½ (c_right − c) over ½ sample    if the neighbor's center is on the surface,
     c_edge − c over t samples        if the surface ends before, at distance t, with the color c_edge,
@@ -12,6 +12,10 @@ and likewise to the other sides:
 - An edge at t > ½ lies in the neighbor, which shows this surface up to it.
 - Where another surface comes in front before the neighbor's center, or the image ends, the opposite half counts alone.
 - Where all neighbors see the same face, the slope is the face's own.
+
+    left edge  sample      sample      sample  right edge
+        ├───t────●────½──┼──½──●────½──┼──½──●───t───┤
+      c_edge     c             c             c     c_edge
 
 These steps add up along a row to the color at the surface's right edge minus that at its left, which the moving edges
 contribute with the other sign. So the two cancel, as they must, if
@@ -63,7 +67,6 @@ from warpshadow.stages.silhouettes.find import Silhouettes
 from warpshadow.stages.silhouettes.lines import (
     NOTHING,
     FragmentArrays,
-    edge_line,
     edge_position_adjoint,
     line_between,
     make_fragment_arrays,
@@ -245,6 +248,110 @@ def detach_near_outlines(fragments: Fragments, has_mean_slope: wp.array) -> Frag
     return replace(fragments, barycentrics=held_barycentrics)
 
 
+@wp.struct
+class _ImageArrays:
+    """The samples of one image, whose color is light times albedo."""
+
+    colors: wp.array(dtype=wp.vec4)
+    light: wp.array(dtype=wp.vec3)
+    albedo: wp.array(dtype=wp.vec3)
+    face_ids: wp.array(dtype=wp.int32)  # of receivers
+    edge_colors: wp.array2d(dtype=wp.vec4)  # [entry of all images, direction]
+
+
+@wp.struct
+class _MovingFactors:
+    """The factors of a sample's color that move with its surface by mean slopes."""
+
+    light: bool
+    albedo: bool
+
+
+@wp.struct
+class _ColorSteps:
+    """Changes of color on the way from a sample to its neighbors, times the gradient of its color."""
+
+    inner: wp.vec2  # to neighbors on its surface, in a row and in a column
+    to_edges: wp.vec4  # to edges of its surface, by direction
+    lengths: wp.vec2  # of these ways in a row and in a column [samples]; 0 where there is none
+    extents: wp.vec2  # of its surface in a row and in a column [samples]
+
+
+@wp.func
+def _is_surrounded(fragments: FragmentArrays, sample: int):
+    """Whether all neighbors of a sample see its face."""
+    result = bool(True)
+    for direction in range(4):
+        if has_neighbor(sample, direction, fragments.width, fragments.height):
+            other = neighbor(sample, direction, fragments.width)
+            result = result and fragments.face_ids[other] == fragments.face_ids[sample]
+    return result
+
+
+@wp.func
+def _inner_step(image: _ImageArrays, sample: int, other: int, adj_color: wp.vec3, moving: _MovingFactors):
+    """The change of color from a sample to another on its surface."""
+    other_light = image.light[sample]
+    if moving.light:
+        other_light = image.light[other]
+    step = wp.dot(wp.cw_mul(adj_color, image.albedo[sample]), other_light - image.light[sample])
+    if moving.albedo:
+        step += wp.dot(adj_color, wp.cw_mul(other_light, image.albedo[other] - image.albedo[sample]))
+    return step
+
+
+@wp.func
+def _measure_steps(
+    image: _ImageArrays,
+    fragments: FragmentArrays,
+    entries: wp.array(dtype=wp.int32),
+    edges: wp.array2d(dtype=wp.vec2i),
+    sample: int,
+    fragment: int,
+    adj_color: wp.vec3,
+    moving: _MovingFactors,
+):
+    """Steps of a sample to its neighbors, or to the edges before these."""
+    steps = _ColorSteps(wp.vec2(), wp.vec4(), wp.vec2(), wp.vec2(1.0, 1.0))  # type: ignore[call-arg]
+    for direction in range(4):
+        axis = direction / 2
+        sign = direction_sign(direction)
+        distance = _distance_to_end(fragments, entries, edges, fragment, direction)
+        other = neighbor(sample, direction, fragments.width)
+        if distance > 0.0:
+            step = image.edge_colors[entries[fragment], direction] - image.colors[sample]
+            adj_step = wp.dot(adj_color, wp.vec3(step[0], step[1], step[2]))
+            steps.to_edges[direction] = wp.where(moving.light, sign * adj_step, 0.0)
+            steps.lengths[axis] += distance
+            steps.extents[axis] += distance - 0.5
+        elif distance == -1.0 and image.face_ids[other] >= 0:
+            steps.inner[axis] += sign * 0.5 * _inner_step(image, sample, other, adj_color, moving)
+            steps.lengths[axis] += 0.5
+    return steps
+
+
+@wp.func
+def _follow_edges(
+    steps: _ColorSteps,
+    image_weight: float,
+    edges: wp.array(dtype=wp.vec2i),
+    center: wp.vec2,
+    samples_per_unit: wp.vec2,
+    clip_positions: wp.array(dtype=wp.vec4),
+    adj_clip_positions: wp.array(dtype=wp.vec4),
+):
+    """Add the gradients of the ends of the edges beside a sample, by its steps to them."""
+    for direction in range(4):
+        axis = direction / 2
+        if steps.to_edges[direction] != 0.0:
+            slope = steps.to_edges[direction] / steps.lengths[axis] * (steps.extents[axis] / image_weight)
+            edge = edges[direction]
+            adj_a, adj_b = edge_position_adjoint(edge, center, axis, -slope * samples_per_unit[axis], clip_positions)
+            if wp.isfinite(adj_a) and wp.isfinite(adj_b):
+                wp.atomic_add(adj_clip_positions, edge[0], adj_a)
+                wp.atomic_add(adj_clip_positions, edge[1], adj_b)
+
+
 @wp.kernel(enable_backward=False)
 def _add_shading_gradients(
     first_row: int,
@@ -271,106 +378,57 @@ def _add_shading_gradients(
 ):
     """A thread owns a run of samples of all instances; ``fragment`` is the index of a sample in flat images."""
     first_sample = (first_row + wp.tid()) * run
-    width = fragments.width
-    samples_per_unit = half_size(width, fragments.height)
+    samples_per_unit = half_size(fragments.width, fragments.height)
     for batch in range(adj_samples.shape[0]):
-        fragment_batch = instance_in(batch, receiver_face_ids.shape[0])
-        albedo_batch = instance_in(batch, albedo.shape[0])
-        receiver_shading = shading[instance_in(batch, shading.shape[0])]
-        light_batch = instance_in(batch, light.shape[0])
-        clip = fragments.clip_positions[fragment_batch]
+        view_batch = instance_in(batch, receiver_face_ids.shape[0])
+        # entries are of all views; where one view_batch serves all images, each has its own colors
+        image = _ImageArrays()
+        image.colors = samples[batch]
+        image.light = light[instance_in(batch, light.shape[0])]
+        image.albedo = albedo[instance_in(batch, albedo.shape[0])]
+        image.face_ids = receiver_face_ids[view_batch]
+        image.edge_colors = edge_colors[batch - view_batch]
+        clip = fragments.clip_positions[view_batch]
+        adj_clip = adj_clip_positions[view_batch]
         for sample in range(first_sample, first_sample + run):
-            fragment = fragment_batch * adj_samples.shape[1] + sample
-            face = fragments.face_ids[fragment]
+            fragment = view_batch * adj_samples.shape[1] + sample
             adj_sample = adj_samples[batch, sample]
             adj_color = wp.vec3(adj_sample[0], adj_sample[1], adj_sample[2])
-            receivers = wp.vec3i()
-            if face >= 0:
-                receivers = receiver_faces[receiver_face_ids[fragment_batch, sample]]
-            is_receiver = receiver_face_ids[fragment_batch, sample] >= first_sample_face
-            is_moving = not is_receiver
+            # a sample that is a receiver has the gradient of the receiver's point instead
+            is_receiver = image.face_ids[sample] >= first_sample_face
+            moving = _MovingFactors(not is_receiver, False)  # type: ignore[call-arg]
             if has_mean_slope:
-                is_moving = is_moving or has_mean_slope[fragment_batch, sample]
-            is_albedo_moving = bool(False)
+                moving.light = moving.light or has_mean_slope[view_batch, sample]
             if albedo_has_mean_slope:
-                is_albedo_moving = albedo_has_mean_slope[fragment_batch, sample]
-            # A sample that is a receiver has the gradient of the receiver's point instead.
-            if face >= 0 and (is_moving or is_albedo_moving) and wp.length_sq(adj_color) > 0.0:
-                adj_light = wp.cw_mul(adj_color, albedo[albedo_batch, sample])
-                sample_light = light[light_batch, sample]
-                color = samples[batch, sample]
-                center = sample_center(fragment, width, fragments.height)
+                moving.albedo = albedo_has_mean_slope[view_batch, sample]
+            is_moving = fragments.face_ids[fragment] >= 0 and (moving.light or moving.albedo)
+            if is_moving and wp.length_sq(adj_color) > 0.0:
+                center = sample_center(fragment, fragments.width, fragments.height)
                 entry = entries[fragment]
-                is_flat = entry < 0 and not is_receiver and not is_albedo_moving
-                for direction in range(4):
-                    if has_neighbor(fragment, direction, width, fragments.height):
-                        is_flat = is_flat and fragments.face_ids[neighbor(fragment, direction, width)] == face
-                weighted_slopes = wp.vec2()
-                distances = wp.vec2()  # lengths over which the differences were measured [samples]
-                edge_steps = wp.vec4()
-                extents = wp.vec2()  # of the sample along both axes [samples]
                 image_weight = float(1.0)
-                if not is_flat:
-                    extents = wp.vec2(1.0, 1.0)
-                    if entry >= 0:
-                        image_weight = wp.max(
-                            find_image_weight(fragment, entry, entries, line_areas, width), MIN_WEIGHT
-                        )
-                    for direction in range(4):
-                        edge = wp.vec2i(NOTHING, NOTHING)
-                        if entry >= 0:
-                            edge = edges[entry, direction]
-                        if edge[0] >= 0:
-                            line = edge_line(edge, center, clip)
-                            t = line_distance(line, direction, samples_per_unit)
-                            if ends_before(line, direction) and t > MIN_DISTANCE and t <= 1.0:
-                                # entries are of all views; where one view serves all images, each has its
-                                # own colors
-                                edge_step = edge_colors[batch - fragment_batch, entry, direction] - color
-                                adj_step = wp.dot(adj_color, wp.vec3(edge_step[0], edge_step[1], edge_step[2]))
-                                edge_steps[direction] = wp.where(is_moving, direction_sign(direction) * adj_step, 0.0)
-                                distances[direction / 2] += t
-                                extents[direction / 2] += t - 0.5
-                        elif edge[0] == NOTHING and has_neighbor(fragment, direction, width, fragments.height):
-                            neighbor_sample = neighbor(sample, direction, width)
-                            if receiver_face_ids[fragment_batch, neighbor_sample] >= 0:
-                                neighbor_light = light[light_batch, neighbor_sample]
-                                if not is_moving:
-                                    neighbor_light = sample_light
-                                color_step = wp.dot(adj_light, neighbor_light - sample_light)
-                                if is_albedo_moving:
-                                    albedo_step = albedo[albedo_batch, neighbor_sample] - albedo[albedo_batch, sample]
-                                    color_step += wp.dot(adj_color, wp.cw_mul(neighbor_light, albedo_step))
-                                weighted_slopes[direction / 2] += direction_sign(direction) * 0.5 * color_step
-                                distances[direction / 2] += 0.5
-                if wp.length_sq(edge_steps) > 0.0:
-                    for direction in range(4):
-                        if edge_steps[direction] != 0.0:
-                            edge_slope = edge_steps[direction] / distances[direction / 2]
-                            edge_slope *= extents[direction / 2] / image_weight
-                            adj_position = -edge_slope * samples_per_unit[direction / 2]
-                            edge = edges[entry, direction]
-                            adj_a, adj_b = edge_position_adjoint(edge, center, direction / 2, adj_position, clip)
-                            if wp.isfinite(adj_a) and wp.isfinite(adj_b):
-                                wp.atomic_add(adj_clip_positions, fragment_batch, edge[0], adj_a)
-                                wp.atomic_add(adj_clip_positions, fragment_batch, edge[1], adj_b)
-                slope = wp.cw_mul(wp.cw_div(weighted_slopes, distances), samples_per_unit)
-                corners = fragments.faces[face]
-                if wp.min(distances) == 0.0:
-                    receiver_slope = _face_slope(
-                        interpolate_weights_adjoint(receiver_shading, receivers, adj_light), corners, center, clip
-                    )
-                    slope = wp.vec2(
-                        wp.where(distances[0] == 0.0, receiver_slope[0], slope[0]),
-                        wp.where(distances[1] == 0.0, receiver_slope[1], slope[1]),
-                    )
-                if entry >= 0 and not is_flat:
-                    slope = wp.cw_mul(slope, extents / image_weight)
+                if entry >= 0:
+                    image_weight = find_image_weight(fragment, entry, entries, line_areas, fragments.width)
+                    image_weight = wp.max(image_weight, MIN_WEIGHT)
+                steps = _ColorSteps(wp.vec2(), wp.vec4(), wp.vec2(), wp.vec2(1.0, 1.0))  # type: ignore[call-arg]
+                if entry >= 0 or is_receiver or moving.albedo or not _is_surrounded(fragments, fragment):
+                    steps = _measure_steps(image, fragments, entries, edges, sample, fragment, adj_color, moving)
+                if wp.length_sq(steps.to_edges) > 0.0:
+                    _follow_edges(steps, image_weight, edges[entry], center, samples_per_unit, clip, adj_clip)
+                slope = wp.cw_mul(wp.cw_div(steps.inner, steps.lengths), samples_per_unit)
+                corners = fragments.faces[fragments.face_ids[fragment]]
+                if wp.min(steps.lengths) == 0.0:
+                    values = shading[instance_in(batch, shading.shape[0])]
+                    adj_light = wp.cw_mul(adj_color, image.albedo[sample])
+                    adj_weights = interpolate_weights_adjoint(values, receiver_faces[image.face_ids[sample]], adj_light)
+                    face_slope = _face_slope(adj_weights, corners, center, clip)
+                    for axis in range(2):
+                        slope[axis] = wp.where(steps.lengths[axis] == 0.0, face_slope[axis], slope[axis])
+                slope = wp.cw_mul(slope, steps.extents / image_weight)
                 weights = fragments.barycentrics[fragment]
                 depth = wp.dot(weights, wp.vec3(clip[corners[0]][3], clip[corners[1]][3], clip[corners[2]][3]))
-                adj_clip = relative_to_ray_adjoint(center, wp.vec3(-slope[0], -slope[1], 0.0)) / depth
-                if wp.isfinite(adj_clip):
-                    interpolate_values_adjoint(adj_clip_positions[fragment_batch], corners, weights, adj_clip)
+                adj_point = relative_to_ray_adjoint(center, wp.vec3(-slope[0], -slope[1], 0.0)) / depth
+                if wp.isfinite(adj_point):
+                    interpolate_values_adjoint(adj_clip, corners, weights, adj_point)
 
 
 def moving_radiance(

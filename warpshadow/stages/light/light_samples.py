@@ -79,7 +79,7 @@ def _map_directions(rows: np.ndarray, v: np.ndarray, columns: np.ndarray, height
 
 
 def cut_map(
-    radiance: np.ndarray, count: int, find_shares: Callable[[LightSamples], np.ndarray] | None = None
+    radiance: np.ndarray, count: int, find_light_shares: Callable[[LightSamples], np.ndarray] | None = None
 ) -> LightSamples:
     """Cut an equirectangular map into rectangles of about the same importance, and take a direction of each.
 
@@ -95,7 +95,7 @@ def cut_map(
     Args:
         radiance: Linear RGB, shape [height, 2·height, 3]; negative lobes of a band-limited map are welcome.
         count: Number of directions, a multiple of 16; runs of 16 and of 4 are close to each other.
-        find_shares: Finds, given directions, the share of receivers' light that comes from each, shape [direction].
+        find_light_shares: Finds, given directions, the share of receivers' light from each, shape [direction].
             Where given, importance, but for bright pixels', goes to directions that receivers see, in a second cut: to
             a room's window.
     """
@@ -124,11 +124,11 @@ def cut_map(
 
     cuts = cut_halves(importance)
     samples = _mean_samples(radiance, solid_angle, cuts)
-    if find_shares is not None:
+    if find_light_shares is not None:
         visible_importance = importance.copy()
         pixels = cuts.round().astype(int).reshape(-1, 4).tolist()
-        for (top, bottom, left, right), share in zip(pixels, find_shares(samples), strict=True):
-            visible_importance[top:bottom, left:right] *= _UNSEEN_SHARE + (1 - _UNSEEN_SHARE) * count * share
+        for (top, bottom, left, right), light_share in zip(pixels, find_light_shares(samples), strict=True):
+            visible_importance[top:bottom, left:right] *= _UNSEEN_SHARE + (1 - _UNSEEN_SHARE) * count * light_share
         visible_importance *= importance[~is_bright].sum() / max(visible_importance[~is_bright].sum(), 1e-300)
         samples = _mean_samples(radiance, solid_angle, cut_halves(np.where(is_bright, importance, visible_importance)))
     permutation = compact_order(samples.directions[0], runs=(CHUNK, BUNDLE))

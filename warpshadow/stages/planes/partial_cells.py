@@ -148,26 +148,26 @@ def _refine_coverage_adjoint(
     for q in range(samples.shape[0]):
         coverage = covered[batch, index, q][0]
         adj_cell = adj_refined[batch, index, q]
-        adj_share = adj_cell[0]
+        adj_cell_share = adj_cell[0]
         weight = _partial_weight(coverage)
         slope = float(1.0)
-        if adj_share != 0.0 and weight > 0.0:
+        if adj_cell_share != 0.0 and weight > 0.0:
             mean_coverage, weights = _find_mean_coverage(planes, samples[q], normal, receiver)
             if weights > 0.0:
                 slope = 1.0 - weight + wp.grad(_partial_weight)(coverage) * (mean_coverage - coverage)
             for s in range(samples.shape[1]):
                 direction = samples[q, s]
-                share = _sample_weight(planes, normal, direction)
-                if share > 0.0 and _direction_coverage(planes, direction, normal, receiver) < 1.0:
+                sample_weight = _sample_weight(planes, normal, direction)
+                if sample_weight > 0.0 and _direction_coverage(planes, direction, normal, receiver) < 1.0:
                     cell = visible_cell(planes, normal, direction)
-                    adj_part = wp.vec4(weight * adj_share * share / weights, 0.0, 0.0, 0.0)
+                    adj_part = wp.vec4(weight * adj_cell_share * sample_weight / weights, 0.0, 0.0, 0.0)
                     for i in range(receiver.side_count):
                         side = load_side(planes, receiver, i)
                         if side.grid.blocks == 1:
                             side_coverage_adjoint(planes, side, cell, adj_part, receiver)
         if adj_covered:
             adj_covered[batch, index, q] = adj_covered[batch, index, q] + wp.vec4(
-                slope * adj_share, adj_cell[1], adj_cell[2], adj_cell[3]
+                slope * adj_cell_share, adj_cell[1], adj_cell[2], adj_cell[3]
             )
     prepare_receiver_adjoint(receiver, inputs, adj_points, adj_front_weights, adj_frames)
 

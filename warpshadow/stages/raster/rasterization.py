@@ -230,6 +230,93 @@ def _is_outside(a: wp.vec4, b: wp.vec4, c: wp.vec4):
     )
 
 
+@wp.struct
+class _ScreenFace:
+    """A face over the samples of an image."""
+
+    is_drawn: bool  # not where it is outside, or seen from the side
+    a: _Edge  # edge functions of sample indices, non-negative on the samples inside
+    b: _Edge
+    c: _Edge
+    depth: wp.vec3d  # of sample indices: linear, as the edges
+    min_depth_bits: int  # of the float32 depth at its samples
+    max_depth_bits: int
+
+
+@wp.func
+def _place_unclipped(a: wp.vec2i, b: wp.vec2i, c: wp.vec2i, depth_a: float, depth_b: float, depth_c: float):
+    """A face of snapped vertices."""
+    face = _ScreenFace()
+    edge_c = _edge(a, b)
+    area = edge_c[0] * wp.int64(c[0]) + edge_c[1] * wp.int64(c[1]) + edge_c[2]
+    if area != wp.int64(0):
+        sign = wp.where(area > wp.int64(0), wp.int64(1), wp.int64(-1))
+        face.is_drawn = True
+        face.a = _shift_to_centers(_edge(b, c), sign)
+        face.b = _shift_to_centers(_edge(c, a), sign)
+        face.c = _shift_to_centers(edge_c, sign)
+        face.depth = _unclipped_depth(a, b, c, area, depth_a, depth_b, depth_c)
+        # Rounding must not carry the depth of a sliver beyond that of its vertices.
+        face.min_depth_bits = wp.cast(wp.min(depth_a, wp.min(depth_b, depth_c)), wp.int32)
+        face.max_depth_bits = wp.cast(wp.max(depth_a, wp.max(depth_b, depth_c)), wp.int32)
+    return face
+
+
+@wp.func
+def _place_clipped(
+    clip_a: wp.vec4, clip_b: wp.vec4, clip_c: wp.vec4, a: wp.vec2i, b: wp.vec2i, c: wp.vec2i, width: int, height: int
+):
+    """A face with vertices behind the eye or far away."""
+    face = _ScreenFace()
+    if not _is_outside(clip_a, clip_b, clip_c):
+        fixed_a = _to_homogeneous(clip_a, width, height)
+        fixed_b = _to_homogeneous(clip_b, width, height)
+        fixed_c = _to_homogeneous(clip_c, width, height)
+        volume = wp.dot(wp.cross(fixed_a, fixed_b), fixed_c)
+        if volume != wp.float64(0.0):
+            sign = wp.where(volume > wp.float64(0.0), wp.int64(1), wp.int64(-1))
+            face.is_drawn = True
+            face.a = _shift_to_centers(_clipped_edge(fixed_b, fixed_c, b, c), sign)
+            face.b = _shift_to_centers(_clipped_edge(fixed_c, fixed_a, c, a), sign)
+            face.c = _shift_to_centers(_clipped_edge(fixed_a, fixed_b, a, b), sign)
+            z = wp.vec3d(wp.float64(clip_a[2]), wp.float64(clip_b[2]), wp.float64(clip_c[2]))
+            face.depth = _clipped_depth(fixed_a, fixed_b, fixed_c, z)
+            face.max_depth_bits = int(_DEPTH_ONE + 1)
+    return face
+
+
+@wp.func
+def _draw_row(face: _ScreenFace, face_bits: wp.int64, row: int, left: int, right: int, keys: wp.array(dtype=wp.int64)):
+    """Offer a face to the samples of a row, from a column to another."""
+    y = wp.int64(row)
+    inside_a = face.a[1] * y + face.a[2]
+    inside_b = face.b[1] * y + face.b[2]
+    inside_c = face.c[1] * y + face.c[2]
+    columns = wp.vec2i(left, right)
+    if right - left >= _TRIM_WIDTH:
+        columns = _trim(columns, face.a[0], inside_a)
+        columns = _trim(columns, face.b[0], inside_b)
+        columns = _trim(columns, face.c[0], inside_c)
+    column = columns[0]
+    x = wp.int64(column)
+    inside_a += face.a[0] * x
+    inside_b += face.b[0] * x
+    inside_c += face.c[0] * x
+    depth_of_row = face.depth[1] * wp.float64(row) + face.depth[2]
+    while column <= columns[1]:
+        if (inside_a | inside_b | inside_c) >= wp.int64(0):
+            depth = float(face.depth[0] * wp.float64(column) + depth_of_row)
+            bits = wp.clamp(wp.cast(depth, wp.int32), face.min_depth_bits, face.max_depth_bits)
+            if bits > 0 and bits <= _DEPTH_ONE:
+                key = (wp.int64(bits) << wp.int64(32)) | face_bits
+                if key > keys[column]:
+                    wp.atomic_max(keys, column, key)
+        inside_a += face.a[0]
+        inside_b += face.b[0]
+        inside_c += face.c[0]
+        column += 1
+
+
 @wp.kernel(enable_backward=False)
 def _rasterize_faces(
     first_row: int,
@@ -256,22 +343,17 @@ def _rasterize_faces(
     layer_index = first_row + row_of_layer
     instance, layer = split_row(layer_index, layer_count)
     face_count = faces.shape[0]
-    face = layer * face_count / layer_count + face_in_layer
-    if face >= (layer + 1) * face_count / layer_count:
+    face_id = layer * face_count / layer_count + face_in_layer
+    if face_id >= (layer + 1) * face_count / layer_count:
         return
-    vertex_a = faces[face][0]
-    vertex_b = faces[face][1]
-    vertex_c = faces[face][2]
-    if (
-        wp.min(vertex_a, wp.min(vertex_b, vertex_c)) < 0
-        or wp.max(vertex_a, wp.max(vertex_b, vertex_c)) >= corners.shape[1]
-    ):
+    vertices = faces[face_id]
+    if wp.min(vertices) < 0 or wp.max(vertices) >= corners.shape[1]:
         if strip == 0:
             wp.atomic_add(fault_counts, layer_index, 1, 1)
         return
-    a = corners[instance, vertex_a]
-    b = corners[instance, vertex_b]
-    c = corners[instance, vertex_c]
+    a = corners[instance, vertices[0]]
+    b = corners[instance, vertices[1]]
+    c = corners[instance, vertices[2]]
     is_clipped = a[0] == _CLIPPED or b[0] == _CLIPPED or c[0] == _CLIPPED
 
     left = 0
@@ -286,78 +368,18 @@ def _rasterize_faces(
     if left > right or top > bottom:
         return
 
-    edge_a = _edge(b, c)
-    edge_b = _edge(c, a)
-    edge_c = _edge(a, b)
-    depth_plane = wp.vec3d()
-    min_depth_bits = 0
-    max_depth_bits = int(_DEPTH_ONE + 1)
-    sign = wp.int64(1)
+    face = _ScreenFace()
     if is_clipped:
-        clip_a = clip_positions[instance, vertex_a]
-        clip_b = clip_positions[instance, vertex_b]
-        clip_c = clip_positions[instance, vertex_c]
-        if _is_outside(clip_a, clip_b, clip_c):
-            return
-        fixed_a = _to_homogeneous(clip_a, width, height)
-        fixed_b = _to_homogeneous(clip_b, width, height)
-        fixed_c = _to_homogeneous(clip_c, width, height)
-        volume = wp.dot(wp.cross(fixed_a, fixed_b), fixed_c)
-        if volume == wp.float64(0.0):
-            return
-        sign = wp.where(volume > wp.float64(0.0), wp.int64(1), wp.int64(-1))
-        edge_a = _clipped_edge(fixed_b, fixed_c, b, c)
-        edge_b = _clipped_edge(fixed_c, fixed_a, c, a)
-        edge_c = _clipped_edge(fixed_a, fixed_b, a, b)
-        z = wp.vec3d(wp.float64(clip_a[2]), wp.float64(clip_b[2]), wp.float64(clip_c[2]))
-        depth_plane = _clipped_depth(fixed_a, fixed_b, fixed_c, z)
+        clip = clip_positions[instance]
+        face = _place_clipped(clip[vertices[0]], clip[vertices[1]], clip[vertices[2]], a, b, c, width, height)
     else:
-        area = edge_c[0] * wp.int64(c[0]) + edge_c[1] * wp.int64(c[1]) + edge_c[2]
-        if area == wp.int64(0):
-            return
-        sign = wp.where(area > wp.int64(0), wp.int64(1), wp.int64(-1))
-        depth_a = depths[instance, vertex_a]
-        depth_b = depths[instance, vertex_b]
-        depth_c = depths[instance, vertex_c]
-        depth_plane = _unclipped_depth(a, b, c, area, depth_a, depth_b, depth_c)
-        # Rounding must not carry the depth of a sliver beyond that of its vertices.
-        min_depth_bits = wp.cast(wp.min(depth_a, wp.min(depth_b, depth_c)), wp.int32)
-        max_depth_bits = wp.cast(wp.max(depth_a, wp.max(depth_b, depth_c)), wp.int32)
-    edge_a = _shift_to_centers(edge_a, sign)
-    edge_b = _shift_to_centers(edge_b, sign)
-    edge_c = _shift_to_centers(edge_c, sign)
-
-    face_bits = wp.int64(_INT32_MASK) - wp.int64(face)
-    row = top + strip
-    while row <= bottom:
-        y = wp.int64(row)
-        inside_a = edge_a[1] * y + edge_a[2]
-        inside_b = edge_b[1] * y + edge_b[2]
-        inside_c = edge_c[1] * y + edge_c[2]
-        columns = wp.vec2i(left, right)
-        if right - left >= _TRIM_WIDTH:
-            columns = _trim(columns, edge_a[0], inside_a)
-            columns = _trim(columns, edge_b[0], inside_b)
-            columns = _trim(columns, edge_c[0], inside_c)
-        column = columns[0]
-        x = wp.int64(column)
-        inside_a += edge_a[0] * x
-        inside_b += edge_b[0] * x
-        inside_c += edge_c[0] * x
-        depth_of_row = depth_plane[1] * wp.float64(row) + depth_plane[2]
-        while column <= columns[1]:
-            if (inside_a | inside_b | inside_c) >= wp.int64(0):
-                depth = float(depth_plane[0] * wp.float64(column) + depth_of_row)
-                bits = wp.clamp(wp.cast(depth, wp.int32), min_depth_bits, max_depth_bits)
-                if bits > 0 and bits <= _DEPTH_ONE:
-                    key = (wp.int64(bits) << wp.int64(32)) | face_bits
-                    if key > keys[layer_index, row, column]:
-                        wp.atomic_max(keys, layer_index, row, column, key)
-            inside_a += edge_a[0]
-            inside_b += edge_b[0]
-            inside_c += edge_c[0]
-            column += 1
-        row += strip_step
+        depth = depths[instance]
+        face = _place_unclipped(a, b, c, depth[vertices[0]], depth[vertices[1]], depth[vertices[2]])
+    if face.is_drawn:
+        row = top + strip
+        while row <= bottom:
+            _draw_row(face, wp.int64(_INT32_MASK) - wp.int64(face_id), row, left, right, keys[layer_index, row])
+            row += strip_step
 
 
 @wp.kernel(enable_backward=False)

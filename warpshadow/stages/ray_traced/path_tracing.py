@@ -166,11 +166,11 @@ def _reflect_direct_light(
         sample_set = int(wp.randu(state) % wp.uint32(directions.shape[0]))
         light = _cosine_to_sky(surfaces, shell, point, normal, directions[sample_set]) * radiance[sample_set]
         if surfaces.emitters.distribution.shape[0] > 0:
-            share = wp.randf(state)
+            choice = wp.randf(state)
             emitter_u = wp.randf(state)
             emitter_v = wp.randf(state)
             light += light_of_point(
-                surfaces.emitters, surfaces.blocker_mesh, point, normal, share, emitter_u, emitter_v
+                surfaces.emitters, surfaces.blocker_mesh, point, normal, choice, emitter_u, emitter_v
             )
         total += wp.cw_mul(_albedo(surfaces, face, weights), light)
     reflected[side] = total / float(point_count)
@@ -212,10 +212,10 @@ def _trace_bounces(
             ray_direction = _cosine_direction(normal, u, v)
             bright_side = int(-1)
             if bright.ray_count > 0 and selection == 0:
-                share = wp.randf(state)
+                choice = wp.randf(state)
                 side_u = wp.randf(state)
                 side_v = wp.randf(state)
-                bright_side, target = point_of_bright_side(bright, corners_of_faces, share, side_u, side_v)
+                bright_side, target = point_of_bright_side(bright, corners_of_faces, choice, side_u, side_v)
                 ray_direction = wp.normalize(target - point)
                 if wp.dot(ray_direction, normal) <= 0.0:
                     break
@@ -238,11 +238,11 @@ def _trace_bounces(
             if cosine > 0.0:
                 total += cosine * wp.cw_mul(throughput, radiance[sample_set])
             if surfaces.emitters.distribution.shape[0] > 0:
-                share = wp.randf(state)
+                choice = wp.randf(state)
                 emitter_u = wp.randf(state)
                 emitter_v = wp.randf(state)
                 emitted = light_of_point(
-                    surfaces.emitters, surfaces.blocker_mesh, point, normal, share, emitter_u, emitter_v
+                    surfaces.emitters, surfaces.blocker_mesh, point, normal, choice, emitter_u, emitter_v
                 )
                 total += wp.cw_mul(throughput, emitted)
             u = wp.randf(state)

@@ -4,7 +4,7 @@ With directions ω_i and the light l_i that each stands for (:func:`.light_sampl
 
     Σ_i l_i V_i max(n·ω_i, 0) / π
 
-Some receivers tell where light comes from, so that most directions go there (:func:`find_shares`).
+Some receivers tell where light comes from, so that most directions go there (:func:`find_light_shares`).
 Rays go through the scene in packets of 16 that are close to each other (:mod:`.ray_packets`).
 
 Neighbors in an image mostly see the same light. So all rays are traced at the corners of squares of pixels alone
@@ -62,7 +62,7 @@ def _make_trace(is_near: bool) -> wp.Kernel:
     def sum_open(open_rays: int, cosine: Lane, light: Vectors) -> wp.vec3: ...  # type: ignore[empty-body]
 
     @wp.func_native(f"""
-    wp::vec_t<{PACKET}, wp::float32> shares;
+    wp::vec_t<{PACKET}, wp::float32> visibility;
     const int words[4] = {{a, b, c, d}};
     for (int lane = 0; lane < {PACKET}; ++lane) {{
         float open = 0.0f, known = 0.0f;
@@ -71,9 +71,9 @@ def _make_trace(is_near: bool) -> wp.Kernel:
             open += weights[corner] * is_open;
             known += weights[corner] * (is_open + is_blocked);
         }}
-        shares[lane] = known > 0.0f ? open / known : 0.0f;
+        visibility[lane] = known > 0.0f ? open / known : 0.0f;
     }}
-    return shares;
+    return visibility;
     """)
     def interpolate(a: int, b: int, c: int, d: int, weights: wp.vec4) -> Lane:  # type: ignore[empty-body]
         """Share of corners at which each ray escapes, among corners at which its visibility is known."""
@@ -142,8 +142,8 @@ def _make_trace(is_near: bool) -> wp.Kernel:
                         brightness = doubtful_light[0] + doubtful_light[1] + doubtful_light[2]
                         if brightness <= tolerance:
                             tolerance -= brightness
-                            shares = interpolate(a, b, c, d, weights[receiver])
-                            irradiance += sum_open(rays, wp.cw_mul(shares, cosine), color)
+                            ray_visibility = interpolate(a, b, c, d, weights[receiver])
+                            irradiance += sum_open(rays, wp.cw_mul(ray_visibility, cosine), color)
                             rays = 0
                 traced_rays, last_face = find_open(tree, point, normal, ray_directions, rays, last_face)
                 open_rays = open_rays | traced_rays
@@ -160,7 +160,7 @@ def _make_trace(is_near: bool) -> wp.Kernel:
     return trace_shared
 
 
-def find_shares(
+def find_light_shares(
     tree: FaceTree, points: wp.array, normals: wp.array, samples: LightSamples, *, shell: np.ndarray = FAR
 ) -> np.ndarray:
     """Find the share of receivers' light that comes from each direction, on average over dim and bright receivers.

@@ -86,8 +86,8 @@ def _rise_to_smooth_surface(
         front += wp.max(height, 0.0) * normal
         back += wp.min(height, 0.0) * normal
         cosine = wp.min(cosine, wp.abs(wp.dot(normal, face_normal)))
-    share = wp.smoothstep(_NO_RISE_COSINE, _FULL_RISE_COSINE, cosine)
-    return share * front, share * back
+    rise_weight = wp.smoothstep(_NO_RISE_COSINE, _FULL_RISE_COSINE, cosine)
+    return rise_weight * front, rise_weight * back
 
 
 @wp.kernel

@@ -82,7 +82,7 @@ def _has_key(keys: wp.array2d(dtype=wp.int32), row: int, column: int, key: int):
 
 
 @wp.func
-def _curvature_error(shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int):
+def _curvature_error(ratios: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int):
     """Error of linear interpolation over a distance of probes beside a probe: an eighth of the second difference."""
     key = keys[row, column]
     curvature_error = float(0.0)
@@ -90,7 +90,7 @@ def _curvature_error(shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.
         i = 1 - axis
         if _has_key(keys, row - i, column - axis, key) and _has_key(keys, row + i, column + axis, key):
             second_difference = (
-                shares[row - i, column - axis] - 2.0 * shares[row, column] + shares[row + i, column + axis]
+                ratios[row - i, column - axis] - 2.0 * ratios[row, column] + ratios[row + i, column + axis]
             )
             curvature_error = wp.max(curvature_error, wp.abs(second_difference) / 8.0)
     return curvature_error
@@ -105,38 +105,38 @@ def _is_one_side(keys: wp.array2d(dtype=wp.int32), row: int, column: int, side: 
 
 
 @wp.func
-def _probe_error(shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int, side: int):
+def _probe_error(ratios: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int, side: int):
     """Error of interpolation between the corners of a square, at the probes in it that see the same."""
-    a = shares[row, column]
-    b = shares[row, column + side]
-    c = shares[row + side, column]
-    d = shares[row + side, column + side]
+    a = ratios[row, column]
+    b = ratios[row, column + side]
+    c = ratios[row + side, column]
+    d = ratios[row + side, column + side]
     probe_error = float(0.0)
     for i in range(side + 1):
         for j in range(side + 1):
             if keys[row + i, column + j] == keys[row, column]:
                 down, right = float(i) / float(side), float(j) / float(side)
-                interpolated_share = a + right * (b - a) + down * (c - a)
+                interpolated_ratio = a + right * (b - a) + down * (c - a)
                 if i + j > side:
-                    interpolated_share = d + (1.0 - right) * (c - d) + (1.0 - down) * (b - d)
-                probe_error = wp.max(probe_error, wp.abs(shares[row + i, column + j] - interpolated_share))
+                    interpolated_ratio = d + (1.0 - right) * (c - d) + (1.0 - down) * (b - d)
+                probe_error = wp.max(probe_error, wp.abs(ratios[row + i, column + j] - interpolated_ratio))
     return probe_error
 
 
 @wp.func
 def _is_accepted_between_probes(
-    shares: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int, tolerance: float
+    ratios: wp.array2d(dtype=float), keys: wp.array2d(dtype=wp.int32), row: int, column: int, tolerance: float
 ):
     """Whether a square of neighboring probes is accepted: by the curvature of the light at these."""
-    min_share = wp.min(shares[row, column], shares[row, column + 1])
-    min_share = wp.min(min_share, wp.min(shares[row + 1, column], shares[row + 1, column + 1]))
-    max_share = wp.max(shares[row, column], shares[row, column + 1])
-    max_share = wp.max(max_share, wp.max(shares[row + 1, column], shares[row + 1, column + 1]))
+    min_ratio = wp.min(ratios[row, column], ratios[row, column + 1])
+    min_ratio = wp.min(min_ratio, wp.min(ratios[row + 1, column], ratios[row + 1, column + 1]))
+    max_ratio = wp.max(ratios[row, column], ratios[row, column + 1])
+    max_ratio = wp.max(max_ratio, wp.max(ratios[row + 1, column], ratios[row + 1, column + 1]))
     curvature_error = float(0.0)
-    if max_share - min_share > tolerance:
+    if max_ratio - min_ratio > tolerance:
         for corner in range(4):
             curvature_error = wp.max(
-                curvature_error, _curvature_error(shares, keys, row + corner / 2, column + corner % 2)
+                curvature_error, _curvature_error(ratios, keys, row + corner / 2, column + corner % 2)
             )
     return curvature_error <= tolerance
 
@@ -147,7 +147,7 @@ def _cut_squares(
     worker: int,
     # in
     probe_keys: wp.array3d(dtype=wp.int32),
-    probe_shares: wp.array3d(dtype=float),
+    probe_ratios: wp.array3d(dtype=float),
     spacing: int,
     tolerance: float,
     # out
@@ -161,12 +161,12 @@ def _cut_squares(
     side = 4 / spacing  # of the largest squares, in probes
     view, i = split_row(first_row + wp.tid(), probe_keys.shape[1] / side)
     view_keys = probe_keys[view]
-    shares = probe_shares[view]
+    ratios = probe_ratios[view]
     for j in range(view_keys.shape[1] / side):
         row = side * i
         column = side * j
         is_accepted = _is_one_side(view_keys, row, column, side)
-        is_accepted = is_accepted and _probe_error(shares, view_keys, row, column, side) <= tolerance
+        is_accepted = is_accepted and _probe_error(ratios, view_keys, row, column, side) <= tolerance
         for quarter in range(4):
             size = int(4)
             top = row + quarter / 2 * (side / 2)
@@ -174,9 +174,9 @@ def _cut_squares(
             if not is_accepted:
                 size = 0
                 if _is_one_side(view_keys, top, left, side / 2):
-                    if spacing == 1 and _probe_error(shares, view_keys, top, left, 2) <= tolerance:
+                    if spacing == 1 and _probe_error(ratios, view_keys, top, left, 2) <= tolerance:
                         size = 2
-                    if spacing == 2 and _is_accepted_between_probes(shares, view_keys, top, left, tolerance):
+                    if spacing == 2 and _is_accepted_between_probes(ratios, view_keys, top, left, tolerance):
                         size = 2
             for pixel in range(4):
                 y = spacing * top + pixel / 2
@@ -187,16 +187,16 @@ def _cut_squares(
 
 
 def find_quadtree(
-    sides: wp.array, keys: np.ndarray, probe_shares: np.ndarray, supersampling: int, *, tolerance: float = TOLERANCE
+    sides: wp.array, keys: np.ndarray, probe_ratios: np.ndarray, supersampling: int, *, tolerance: float = TOLERANCE
 ) -> Quadtree:
     """Find the squares in which samples interpolate.
 
     Args:
         sides: Side that each sample sees, −1 for none, int32 of shape [view, height, width].
         keys: A number for each side, equal for sides in one plane, −1 for sides without squares.
-        probe_shares: Light at the samples of :func:`probe_grid`, over that where nothing blocks any, float32 of shape
+        probe_ratios: Light at the samples of :func:`probe_grid`, over that where nothing blocks any, float32 of shape
             [view, row, column]; anything where they see no side that has squares.
-        tolerance: Error of interpolation at which a square is cut, in the unit of the shares.
+        tolerance: Error of interpolation at which a square is cut, in the unit of the ratios.
     """
     device, (view_count, height, width) = sides.device, sides.shape
     shape = view_count, height // supersampling, width // supersampling
@@ -205,7 +205,7 @@ def find_quadtree(
     probe_keys = keys_of(sides, keys, supersampling)
     inputs = [
         from_numpy(probe_keys, dtype=wp.int32, device=device),
-        from_numpy(probe_shares, dtype=wp.float32, device=device),
+        from_numpy(probe_ratios, dtype=wp.float32, device=device),
     ]
     spacing = probe_spacing(sides.shape[1:], supersampling)
     side = MAX_SIDE // spacing

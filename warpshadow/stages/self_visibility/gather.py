@@ -73,8 +73,8 @@ class _ProbeFunctions(NamedTuple):
     """Kernel functions on the probes of a block."""
 
     load_block: wp.Function
-    add_cell_shares: wp.Function
-    load_share: wp.Function
+    add_cell_visibility: wp.Function
+    load_visibility: wp.Function
 
 
 @functools.cache
@@ -111,48 +111,52 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
         for (int lane = 0; lane < {lanes}; ++lane)
             packed[lane] = wp::index(words, rows.c[lane], word);
         for (int part = 0; part < {_CELLS_PER_WORD}; ++part) {{
-            auto& share = wp::index(shares, word * {_CELLS_PER_WORD} + part);
+            auto& visibility = wp::index(cell_visibility, word * {_CELLS_PER_WORD} + part);
             for (int lane = 0; lane < {lanes}; ++lane)
-                share.c[lane] += weights.c[lane] * ((wp::float32)((packed[lane] >> 8 * part) & 255) * unit);
+                visibility.c[lane] += weights.c[lane] * ((wp::float32)((packed[lane] >> 8 * part) & 255) * unit);
         }}
     }}
     """)
-    def add_cell_shares(rows: Rows, weights: Lane, words: wp.array2d(dtype=wp.uint32), shares: wp.array(dtype=Lane)):
-        """shares[cell] += weight · S of all coarse cells in a row of each receiver."""
+    def add_cell_visibility(
+        rows: Rows, weights: Lane, words: wp.array2d(dtype=wp.uint32), cell_visibility: wp.array(dtype=Lane)
+    ):
+        """cell_visibility[cell] += weight · S of all coarse cells in a row of each receiver."""
         ...
 
     @wp.func
-    def load_share(rows: Rows, uses_rays: int, index: int, inputs: GatherInputs):
+    def load_visibility(rows: Rows, uses_rays: int, index: int, inputs: GatherInputs):
         """S of a ray or coarse cell in a row of each receiver, from 0 to 1."""
-        share = Lane()
+        visibility = Lane()
         for lane in range(lanes):
             if uses_rays == 1:
-                share[lane] = float(int((inputs.bits[rows[lane], index >> 5] >> wp.uint32(index & 31)) & wp.uint32(1)))
+                visibility[lane] = float(
+                    int((inputs.bits[rows[lane], index >> 5] >> wp.uint32(index & 31)) & wp.uint32(1))
+                )
             else:
                 word = inputs.words[rows[lane], index // _CELLS_PER_WORD]
                 byte = (word >> wp.uint32(8 * (index % _CELLS_PER_WORD))) & wp.uint32(255)
-                share[lane] = float(int(byte)) * (1.0 / 255.0)
-        return share
+                visibility[lane] = float(int(byte)) * (1.0 / 255.0)
+        return visibility
 
     @wp.func
-    def load_block(inputs: GatherInputs, row: int, receiver_count: int, shares: wp.array(dtype=Lane)):
+    def load_block(inputs: GatherInputs, row: int, receiver_count: int, cell_visibility: wp.array(dtype=Lane)):
         """Load a block of receivers, and S of all coarse cells where there are several."""
         batch, block = find_block(row, receiver_count)
         probes = load_probes(inputs, batch, block)
         if wp.static(lanes > 1):
-            for cell in range(shares.shape[0]):
-                shares[cell] = Lane(0.0)
+            for cell in range(cell_visibility.shape[0]):
+                cell_visibility[cell] = Lane(0.0)
             for corner in range(probes.corner_count):
-                add_cell_shares(probes.rows[corner], probes.weights[corner], inputs.words, shares)
+                add_cell_visibility(probes.rows[corner], probes.weights[corner], inputs.words, cell_visibility)
         return batch, block, load(inputs.normals[instance_in(batch, inputs.normals.shape[0])], block), probes
 
-    return _ProbeFunctions(load_block, add_cell_shares, load_share)
+    return _ProbeFunctions(load_block, add_cell_visibility, load_visibility)
 
 
 @functools.cache
 def _make_gather(lanes: int) -> wp.Kernel:
     Lane, fn = lane_type(lanes), make_lane_functions(lanes)
-    load_block, _add_cell_shares, load_share = _make_probe_functions(lanes)
+    load_block, _add_cell_visibility, load_visibility = _make_probe_functions(lanes)
     store_columns, dot_direction, is_any_above = fn.store_columns, fn.dot_direction, fn.is_any_above
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
@@ -168,9 +172,9 @@ def _make_gather(lanes: int) -> wp.Kernel:
     ):
         """A thread owns a block of receivers."""
         item = first_row + wp.tid()
-        shares = scratch[scratch_slot(worker, item), 0]
+        cell_visibility = scratch[scratch_slot(worker, item), 0]
         columns = scratch[scratch_slot(worker, item), 1]
-        batch, block, normal, probes = load_block(inputs, item, transmittance_self.shape[1], shares)
+        batch, block, normal, probes = load_block(inputs, item, transmittance_self.shape[1], cell_visibility)
         weight_batch = instance_in(batch, inputs.counts.shape[0])
         for q in range(inputs.directions.shape[0]):
             transmittance = Lane(0.0)
@@ -182,11 +186,11 @@ def _make_gather(lanes: int) -> wp.Kernel:
                 if wp.static(lanes == 1) or uses_rays == 1:
                     for k in range(inputs.counts[weight_batch, q]):
                         for corner in range(probes.corner_count):
-                            share = load_share(probes.rows[corner], uses_rays, indices[k], inputs)
-                            transmittance += weights[k] * wp.cw_mul(probes.weights[corner], share)
+                            visibility = load_visibility(probes.rows[corner], uses_rays, indices[k], inputs)
+                            transmittance += weights[k] * wp.cw_mul(probes.weights[corner], visibility)
                 else:
                     for k in range(inputs.counts[weight_batch, q]):
-                        transmittance += weights[k] * shares[indices[k]]
+                        transmittance += weights[k] * cell_visibility[indices[k]]
             for lane in range(lanes):
                 transmittance[lane] = wp.where(cosine[lane] > 0.0, transmittance[lane], 1.0)
             if wp.static(lanes == 1):
@@ -202,7 +206,7 @@ def _make_gather(lanes: int) -> wp.Kernel:
 @functools.cache
 def _make_gather_adjoint(lanes: int) -> wp.Kernel:
     Lane, fn = lane_type(lanes), make_lane_functions(lanes)
-    load_block, add_cell_shares, load_share = _make_probe_functions(lanes)
+    load_block, add_cell_visibility, load_visibility = _make_probe_functions(lanes)
     dot_direction, is_any_above, total = fn.dot_direction, fn.is_any_above, fn.total
     Weights = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
 
@@ -225,13 +229,13 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         The latter is summed up by cells first:  S̄_c = Σ_qk T̄_q w_qk where c_qk = c,  b̄_j += Σ_c S̄_c S_jc.
         """
         item = first_row + wp.tid()
-        shares = scratch[scratch_slot(worker, item), 0]
-        adj_shares = scratch[scratch_slot(worker, item), 1]
-        batch, block, normal, probes = load_block(inputs, item, adj_transmittance.shape[1], shares)
+        cell_visibility = scratch[scratch_slot(worker, item), 0]
+        adj_cell_visibility = scratch[scratch_slot(worker, item), 1]
+        batch, block, normal, probes = load_block(inputs, item, adj_transmittance.shape[1], cell_visibility)
         weight_batch = instance_in(batch, inputs.counts.shape[0])
         if wp.static(lanes > 1):
-            for cell in range(shares.shape[0]):
-                adj_shares[cell] = Lane(0.0)
+            for cell in range(cell_visibility.shape[0]):
+                adj_cell_visibility[cell] = Lane(0.0)
         receiver_count = wp.min(lanes, adj_transmittance.shape[1] - block * lanes)
         adj_corner_weights = Weights()
         for q in range(inputs.directions.shape[0]):
@@ -248,11 +252,11 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                         adj_weight = float(0.0)
                         for corner in range(3):
                             if corner < probes.corner_count:
-                                adj_share = wp.cw_mul(
-                                    adj, load_share(probes.rows[corner], uses_rays, indices[k], inputs)
+                                adj_visibility = wp.cw_mul(
+                                    adj, load_visibility(probes.rows[corner], uses_rays, indices[k], inputs)
                                 )
-                                adj_corner_weights[corner] += weights[k] * adj_share
-                                adj_weight += total(wp.cw_mul(probes.weights[corner], adj_share))
+                                adj_corner_weights[corner] += weights[k] * adj_visibility
+                                adj_weight += total(wp.cw_mul(probes.weights[corner], adj_visibility))
                         if adj_resampling_weights:
                             if wp.static(lanes == 1):
                                 adj_weight = sum_over_warp(
@@ -264,19 +268,19 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                                 wp.atomic_add(adj_resampling_weights, weight_batch, q, k, adj_weight)
                 else:
                     for k in range(inputs.counts[weight_batch, q]):
-                        adj_shares[indices[k]] = adj_shares[indices[k]] + weights[k] * adj
+                        adj_cell_visibility[indices[k]] = adj_cell_visibility[indices[k]] + weights[k] * adj
                         if adj_resampling_weights:
-                            adj_weight_sum = total(wp.cw_mul(adj, shares[indices[k]]))
+                            adj_weight_sum = total(wp.cw_mul(adj, cell_visibility[indices[k]]))
                             wp.atomic_add(adj_resampling_weights, weight_batch, q, k, adj_weight_sum)
         if adj_probe_weights:
             for corner in range(3):
                 adj_corner = adj_corner_weights[corner]
                 if wp.static(lanes > 1):
-                    for cell in range(shares.shape[0]):
-                        shares[cell] = Lane(0.0)
-                    add_cell_shares(probes.rows[corner], Lane(1.0), inputs.words, shares)
-                    for cell in range(shares.shape[0]):
-                        adj_corner += wp.cw_mul(adj_shares[cell], shares[cell])
+                    for cell in range(cell_visibility.shape[0]):
+                        cell_visibility[cell] = Lane(0.0)
+                    add_cell_visibility(probes.rows[corner], Lane(1.0), inputs.words, cell_visibility)
+                    for cell in range(cell_visibility.shape[0]):
+                        adj_corner += wp.cw_mul(adj_cell_visibility[cell], cell_visibility[cell])
                 for lane in range(receiver_count):
                     receiver = block * lanes + lane
                     adj_corner_vector = wp.vec3()

@@ -180,10 +180,10 @@ def _average_cells(
         if cosine > -mirror_sine:
             weight_sum += wp.abs(cosine)
             open_weight += wp.abs(cosine) * float(_ray_bit(bits, row, ray))
-    share = float(1.0)
+    open_share = float(1.0)
     if weight_sum > 0.0:
-        share = open_weight / weight_sum
-    cells[row, cell] = wp.uint8(int(255.0 * share + 0.5))
+        open_share = open_weight / weight_sum
+    cells[row, cell] = wp.uint8(int(255.0 * open_share + 0.5))
 
 
 def trace_rows(

@@ -61,16 +61,16 @@ def _sum_cells(
     lookup: CellLookup, transmittance: wp.array(dtype=wp.float32), normal: wp.vec3, direction: wp.vec3, texel: int
 ):
     """The sums of k min(T, H) and of k H over the cells near a direction."""
-    through = float(0.0)
-    whole = float(0.0)
+    open_sum = float(0.0)
+    weight_sum = float(0.0)
     for i in range(lookup.neighbors.shape[1]):
         cell = lookup.neighbors[texel, i]
         kernel = wp.max(wp.dot(direction, lookup.cells[cell]) - lookup.reach_cosine, 0.0)
         weight = kernel * kernel + _NEGLIGIBLE
-        above = wp.smoothstep(-1.0, 1.0, lookup.per_radius * wp.dot(normal, lookup.cells[cell])) + _NEGLIGIBLE
-        through += weight * wp.min(transmittance[cell], above)
-        whole += weight * above
-    return through, whole
+        horizon_weight = wp.smoothstep(-1.0, 1.0, lookup.per_radius * wp.dot(normal, lookup.cells[cell])) + _NEGLIGIBLE
+        open_sum += weight * wp.min(transmittance[cell], horizon_weight)
+        weight_sum += weight * horizon_weight
+    return open_sum, weight_sum
 
 
 @wp.kernel(enable_backward=False)
@@ -103,8 +103,8 @@ def _find_transfer(
             if transmittance:
                 direction = wp.normalize(beam)
                 cells = transmittance[batch, receiver]
-                through, whole = _sum_cells(lookup, cells, normal, direction, texel_of(direction))
-                value *= through / whole
+                open_sum, weight_sum = _sum_cells(lookup, cells, normal, direction, texel_of(direction))
+                value *= open_sum / weight_sum
         transfer[batch, receiver, k] = value
 
 
@@ -160,10 +160,10 @@ def _find_transfer_adjoint(
                 distance = wp.sqrt(distance2)
                 direction = beam / distance
                 texel = texel_of(direction)
-                through, whole = _sum_cells(lookup, transmittance[batch, receiver], normal, direction, texel)
-                mean = through / whole
-                adj_through = factor * adj / whole
-                adj_whole = -adj_through * mean
+                open_sum, weight_sum = _sum_cells(lookup, transmittance[batch, receiver], normal, direction, texel)
+                mean = open_sum / weight_sum
+                adj_open_sum = factor * adj / weight_sum
+                adj_weight_sum = -adj_open_sum * mean
                 adj_direction = wp.vec3()
                 for i in range(lookup.neighbors.shape[1]):
                     cell = lookup.neighbors[texel, i]
@@ -171,21 +171,23 @@ def _find_transfer_adjoint(
                     kernel = wp.max(wp.dot(direction, cell_direction) - lookup.reach_cosine, 0.0)
                     weight = kernel * kernel + _NEGLIGIBLE
                     height = lookup.per_radius * wp.dot(normal, cell_direction)
-                    above = wp.smoothstep(-1.0, 1.0, height) + _NEGLIGIBLE
+                    horizon_weight = wp.smoothstep(-1.0, 1.0, height) + _NEGLIGIBLE
                     cell_transmittance = transmittance[batch, receiver, cell]
-                    adj_weight = adj_through * wp.min(cell_transmittance, above) + adj_whole * above
+                    adj_weight = (
+                        adj_open_sum * wp.min(cell_transmittance, horizon_weight) + adj_weight_sum * horizon_weight
+                    )
                     adj_direction += 2.0 * kernel * adj_weight * cell_direction
-                    adj_above = adj_whole * weight
-                    if cell_transmittance < above:
+                    adj_horizon_weight = adj_weight_sum * weight
+                    if cell_transmittance < horizon_weight:
                         if adj_transmittance:
                             adj_transmittance[batch, receiver, cell] = (
-                                adj_transmittance[batch, receiver, cell] + adj_through * weight
+                                adj_transmittance[batch, receiver, cell] + adj_open_sum * weight
                             )
                     else:
-                        adj_above += adj_through * weight
+                        adj_horizon_weight += adj_open_sum * weight
                     if height > -1.0 and height < 1.0:
                         slope = 0.75 * (1.0 - height * height)  # of the smoothstep from −1 to 1
-                        adj_normal += adj_above * slope * lookup.per_radius * cell_direction
+                        adj_normal += adj_horizon_weight * slope * lookup.per_radius * cell_direction
                 adj_beam += (adj_direction - wp.dot(direction, adj_direction) * direction) / distance
             product = adj * mean * factor
             square = wp.pi * wp.pi * distance2 * distance2

@@ -72,14 +72,15 @@ def _halving(fine_count: int, coarse_count: int) -> csr_matrix:
 
     coarse = np.arange(coarse_count)
     if fine_count == 1:
-        shares = np.ones((1, 1))
+        fine_weights = np.ones((1, 1))
     elif fine_count == 2 * coarse_count:
-        shares = np.full((coarse_count, 2), 0.5)
+        fine_weights = np.full((coarse_count, 2), 0.5)
     else:
-        shares = np.stack([coarse_count - coarse, np.full(coarse_count, coarse_count), coarse + 1], axis=1) / fine_count
-    fine_indices = 2 * coarse[:, None] + np.arange(shares.shape[1])
-    starts = np.arange(coarse_count + 1) * shares.shape[1]
-    return csr_matrix((shares.ravel(), fine_indices.ravel(), starts), (coarse_count, fine_count))
+        weights = [coarse_count - coarse, np.full(coarse_count, coarse_count), coarse + 1]
+        fine_weights = np.stack(weights, axis=1) / fine_count
+    fine_indices = 2 * coarse[:, None] + np.arange(fine_weights.shape[1])
+    starts = np.arange(coarse_count + 1) * fine_weights.shape[1]
+    return csr_matrix((fine_weights.ravel(), fine_indices.ravel(), starts), (coarse_count, fine_count))
 
 
 class _Layout:
@@ -127,7 +128,7 @@ def _shares(coarse: int, fine_count: int, coarse_count: int):
 
 @wp.func
 def _fine_texels(texel: int, fine: wp.vec3i, coarse: wp.vec3i):
-    """First of the 3 × 3 fine texels around a coarse one, and the shares of their columns and rows."""
+    """First of the 3 × 3 fine texels around a coarse one, and the weights of their columns and rows."""
     row = texel // coarse[1]
     column = texel - row * coarse[1]
     start = fine[0] + 2 * row * fine[1] + 2 * column
@@ -147,13 +148,13 @@ def _halve(
     batch, thread = wp.tid()
     instance_texels = texels[batch]
     for texel in range(thread * run, (thread + 1) * run):
-        start, column_shares, row_shares = _fine_texels(texel, fine, coarse)
+        start, column_weights, row_weights = _fine_texels(texel, fine, coarse)
         mean = wp.vec3()
         for i in range(3):
-            if row_shares[i] > 0.0:
+            if row_weights[i] > 0.0:
                 for j in range(3):
-                    if column_shares[j] > 0.0:
-                        mean += (row_shares[i] * column_shares[j]) * instance_texels[start + i * fine[1] + j]
+                    if column_weights[j] > 0.0:
+                        mean += (row_weights[i] * column_weights[j]) * instance_texels[start + i * fine[1] + j]
         instance_texels[coarse[0] + texel] = mean
 
 
@@ -170,14 +171,14 @@ def _halve_adjoint(
     batch, thread = wp.tid()
     instance_texels = adj_texels[batch]
     for texel in range(thread * run, (thread + 1) * run):
-        start, column_shares, row_shares = _fine_texels(texel, fine, coarse)
+        start, column_weights, row_weights = _fine_texels(texel, fine, coarse)
         adj_mean = instance_texels[coarse[0] + texel]
         for i in range(3):
-            if row_shares[i] > 0.0:
+            if row_weights[i] > 0.0:
                 for j in range(3):
-                    if column_shares[j] > 0.0:
+                    if column_weights[j] > 0.0:
                         wp.atomic_add(
-                            instance_texels, start + i * fine[1] + j, (row_shares[i] * column_shares[j]) * adj_mean
+                            instance_texels, start + i * fine[1] + j, (row_weights[i] * column_weights[j]) * adj_mean
                         )
 
 

@@ -66,7 +66,7 @@ def _line_reach(count: float):
 
 
 @wp.func
-def _probe_share(probe: int, count: float):
+def _find_probe_weight(probe: int, count: float):
     """Weight of a probe among ``count``: the part of the line in its stretch, so outer ones fade in as it grows."""
     return wp.min(0.5 * (count + 1.0) - float(wp.abs(probe)), 1.0)
 
@@ -133,9 +133,9 @@ def _filter_line(texels: wp.array(dtype=wp.vec3), level: wp.vec3i, uv: wp.vec2, 
         x = texel_position[0] + float(probe) * probe_line[0] * float(level[1])
         y = texel_position[1] - float(probe) * probe_line[1] * float(level[2])
         cell = _cell(level, x, y)
-        share = scale * _probe_share(probe, probe_line[3])
-        lower_weight = share * cell.t
-        upper_weight = share - lower_weight
+        probe_weight = scale * _find_probe_weight(probe, probe_line[3])
+        lower_weight = probe_weight * cell.t
+        upper_weight = probe_weight - lower_weight
         color += (
             (upper_weight * (1.0 - cell.s)) * texels[cell.above_left]
             + (upper_weight * cell.s) * texels[cell.above_right]
@@ -163,8 +163,8 @@ def _scatter(
         x = texel_position[0] + float(probe) * probe_line[0] * float(level[1])
         y = texel_position[1] - float(probe) * probe_line[1] * float(level[2])
         cell = _cell(level, x, y)
-        lower_weight = _probe_share(probe, probe_line[3]) * cell.t
-        upper_weight = _probe_share(probe, probe_line[3]) - lower_weight
+        lower_weight = _find_probe_weight(probe, probe_line[3]) * cell.t
+        upper_weight = _find_probe_weight(probe, probe_line[3]) - lower_weight
         wp.atomic_add(adj_texels, cell.above_left, (upper_weight * (1.0 - cell.s)) * adj_sum)
         wp.atomic_add(adj_texels, cell.above_right, (upper_weight * cell.s) * adj_sum)
         wp.atomic_add(adj_texels, cell.below_left, (lower_weight * (1.0 - cell.s)) * adj_sum)
@@ -324,7 +324,7 @@ def _sample_adjoint_by_coordinates(
             for probe in range(-line_reach, line_reach + 1):
                 uv = sample_inputs.uvs[footprint_batch, sample]
                 step = float(probe) * wp.vec2(probe_line[0], probe_line[1])
-                weight = _probe_share(probe, count) / count
+                weight = _find_probe_weight(probe, count) / count
                 slopes = _slopes(instance_texels, sample_inputs.levels[texture, level], uv, step, adj_color)
                 adj_width = float(0.0)
                 if coarse_share > 0.0:

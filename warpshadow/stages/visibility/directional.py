@@ -208,10 +208,10 @@ def _make_transmit_adjoint(has_horizon: bool, has_footprints: bool, lanes: int) 
 
     @wp.func(inline=True)
     def share_adjoint(
-        sphere_view: SphereView, weight: Lane, share: Lane, slot: int, direction: int, task: TransmittanceTask
+        sphere_view: SphereView, weight: Lane, blocked_share: Lane, slot: int, direction: int, task: TransmittanceTask
     ):
         """ā_i = −T̄ T / (1 − a_i)."""
-        return -wp.cw_div(task.transmittances[slot], wp.max(Lane(1.0) - share, Lane(1.0e-7)))
+        return -wp.cw_div(task.transmittances[slot], wp.max(Lane(1.0) - blocked_share, Lane(1.0e-7)))
 
     cap_adjoint = make_cap_adjoint(
         has_horizon, find_weight, share_adjoint, False, TransmittanceTask, lanes, has_footprints

@@ -57,11 +57,11 @@ def make_falloff_adjoint(lanes: int) -> wp.Function:
         inner_sine = wp.max(wp.cw_mul(cos_width, sine) - wp.cw_mul(sin_width, cone.cosine), Lane(0.0))
         high = sqrt(Lane(1.0) - wp.cw_mul(inner_sine, inner_sine))
         inverse = wp.cw_div(Lane(1.0), Lane(1.0) - 0.5 * (high + low))
-        share = wp.cw_mul(wp.cw_div(cone.sine2, Lane(1.0) + cone.cosine), inverse)
-        is_below_one = wp.min(wp.max((Lane(1.0) - share) * 1.0e20, Lane(0.0)), Lane(1.0))
-        adj_weight = wp.cw_mul(adj_opacity, wp.min(share, Lane(1.0)))
+        cap_share = wp.cw_mul(wp.cw_div(cone.sine2, Lane(1.0) + cone.cosine), inverse)
+        is_below_one = wp.min(wp.max((Lane(1.0) - cap_share) * 1.0e20, Lane(0.0)), Lane(1.0))
+        adj_weight = wp.cw_mul(adj_opacity, wp.min(cap_share, Lane(1.0)))
         adj_solid_angle = wp.cw_mul(wp.cw_mul(is_below_one, wp.cw_mul(adj_opacity, cone.weight)), inverse)
-        adj_bound = 0.5 * wp.cw_mul(adj_solid_angle, share)
+        adj_bound = 0.5 * wp.cw_mul(adj_solid_angle, cap_share)
         total_adj_low = adj_low + adj_bound
         total_adj_high = adj_high + adj_bound
         adj_inner_sine = -wp.cw_div(wp.cw_mul(total_adj_high, inner_sine), high)
@@ -116,7 +116,7 @@ def make_sphere_adjoint(lanes: int) -> wp.Function:
             -wp.cw_mul(slope, sum_adj_t_t),
             adj_opacity,
         )
-        adj_cone = Cone(scale(slope, sum_omega), adj_cosine, adj_sine2, wp.cw_mul(adj_weight, sphere_view.share))
+        adj_cone = Cone(scale(slope, sum_omega), adj_cosine, adj_sine2, wp.cw_mul(adj_weight, sphere_view.merge_weight))
         adj_offset, adj_radius = cone_adjoint(sphere_view.offset, sphere_view.curvature, sphere_view.cone, adj_cone)
         return adj_offset, adj_radius, adj_weight, adj_cos_width, adj_sin_width
 
@@ -151,8 +151,8 @@ def make_cap_adjoint(
     Args:
         has_horizon: Whether receivers have normals.
         find_weight: (sphere_view, task) → a weight of the sphere for each receiver.
-        share_adjoint: (sphere_view, weight, share, slot, direction, task) → ā of a cell of which the sphere blocks the
-            share a = A step(t). Slot is the number of the cell among the thread's, direction that among all.
+        share_adjoint: (sphere_view, weight, blocked_share, slot, direction, task) → ā of a cell, of which the sphere
+            blocks a = A step(t). Slot is the number of the cell among the thread's, direction that among all.
         is_costly: Whether that costs more than the test for cells of which the sphere blocks nothing.
         Task: Struct as for :func:`.culling.make_cull`.
 
@@ -201,11 +201,13 @@ def make_cap_adjoint(
                     t, step = soft_edge(omega, cap, slope)
                     if is_looked_at(t):
                         is_any_blocked = True
-                        share = wp.cw_mul(opacity, step)
-                        adj_share = share_adjoint(sphere_view, weight, share, bundle * BUNDLE + i, direction, task)
-                        adj_opacity += wp.cw_mul(adj_share, step)
+                        blocked_share = wp.cw_mul(opacity, step)
+                        adj_blocked_share = share_adjoint(
+                            sphere_view, weight, blocked_share, bundle * BUNDLE + i, direction, task
+                        )
+                        adj_opacity += wp.cw_mul(adj_blocked_share, step)
                         step_slope = wp.cw_mul(t, Lane(1.0) - t)
-                        adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_share, opacity), step_slope)
+                        adj_t = 6.0 * wp.cw_mul(wp.cw_mul(adj_blocked_share, opacity), step_slope)
                         sum_adj_t += adj_t
                         sum_adj_t_t += wp.cw_mul(adj_t, t)
                         sum_x += omega[0] * adj_t

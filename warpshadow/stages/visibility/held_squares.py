@@ -40,15 +40,15 @@ def _make_square_share(lanes: int) -> wp.Function:
 
     @wp.func
     def find_square_share(overshoot: Lane):
-        share = Lane(1.0)
+        square_share = Lane(1.0)
         slope = Lane(0.0)
         if wp.max(overshoot) > SQUARED_BELOW:
             for lane in range(lanes):
                 if overshoot[lane] > SQUARED_BELOW:
                     t = wp.min(wp.log(overshoot[lane] / SQUARED_BELOW) * PER_LOG_RANGE, 1.0)
-                    share[lane] = 1.0 - wp.smoothstep(0.0, 1.0, t)
+                    square_share[lane] = 1.0 - wp.smoothstep(0.0, 1.0, t)
                     slope[lane] = -6.0 * PER_LOG_RANGE * t * (1.0 - t) / overshoot[lane]
-        return share, slope
+        return square_share, slope
 
     return find_square_share
 
@@ -62,11 +62,11 @@ def make_square(order: int, lanes: int) -> wp.Function:
     @wp.func
     def square_held(row: wp.array(dtype=Lane), depth: Lane, table: ProductTable, square: wp.array(dtype=Lane)):
         multiply(row, row, table, square)
-        share, _slope = find_square_share(wp.cw_mul(depth, square[0] - row[0]) / UNIT)
-        held_share = Lane(1.0) - share
+        square_share, _slope = find_square_share(wp.cw_mul(depth, square[0] - row[0]) / UNIT)
+        held_share = Lane(1.0) - square_share
         if wp.max(held_share) > 0.0:
             for i in range(wp.static(order**2)):
-                square[i] = wp.cw_mul(held_share, row[i]) + wp.cw_mul(share, square[i])
+                square[i] = wp.cw_mul(held_share, row[i]) + wp.cw_mul(square_share, square[i])
         return held_share
 
     return square_held
@@ -93,21 +93,21 @@ def make_square_adjoint(order: int, lanes: int) -> wp.Function:
         multiply(row, adj_square, table, adj_row)
         mean_square = Lane(0.0)
         row_dot = Lane(0.0)
-        adj_share = Lane(0.0)
+        adj_square_share = Lane(0.0)
         for i in range(wp.static(order**2)):
             mean_square += wp.cw_mul(row[i], row[i])
             row_dot += wp.cw_mul(row[i], adj_square[i])
-            adj_share += wp.cw_mul(row[i], adj_row[i] - adj_square[i])
+            adj_square_share += wp.cw_mul(row[i], adj_row[i] - adj_square[i])
         mean_excess = (mean_square / UNIT - row[0]) / UNIT
-        share, share_slope = find_square_share(wp.cw_mul(depth, mean_excess))
+        square_share, square_share_slope = find_square_share(wp.cw_mul(depth, mean_excess))
         for i in range(wp.static(order**2)):
-            adj_row[i] = adj_square[i] + wp.cw_mul(share, 2.0 * adj_row[i] - adj_square[i])
-        adj_overshoot = wp.cw_mul(adj_share, share_slope)
-        if wp.min(share_slope) < 0.0:
+            adj_row[i] = adj_square[i] + wp.cw_mul(square_share, 2.0 * adj_row[i] - adj_square[i])
+        adj_overshoot = wp.cw_mul(adj_square_share, square_share_slope)
+        if wp.min(square_share_slope) < 0.0:
             adj_mean_excess = wp.cw_mul(adj_overshoot, depth)
             for i in range(wp.static(order**2)):
                 adj_row[i] = adj_row[i] + (2.0 / UNIT / UNIT) * wp.cw_mul(adj_mean_excess, row[i])
             adj_row[0] = adj_row[0] - adj_mean_excess / UNIT
-        return row_dot + wp.cw_mul(share, adj_share), wp.cw_mul(adj_overshoot, mean_excess)
+        return row_dot + wp.cw_mul(square_share, adj_square_share), wp.cw_mul(adj_overshoot, mean_excess)
 
     return square_held_adjoint

@@ -186,7 +186,7 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
                 adj_axis,
                 wp.cw_mul(adj_cosine, zonal_scale),
                 wp.cw_mul(adj_zonal_scale, faded_weight),
-                wp.cw_mul(adj_weight, sphere_view.share),
+                wp.cw_mul(adj_weight, sphere_view.merge_weight),
             )
             adj_offset, adj_radius = cone_adjoint(sphere_view.offset, sphere_view.curvature, cone, adj_cone)
             adj_height = sphere_view.curvature * wp.cw_mul(wp.cw_mul(adj_faded_weight, cone.weight), fade_slope)

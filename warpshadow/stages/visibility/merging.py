@@ -72,10 +72,10 @@ def _merge_clusters(
     )
     max_radius = wp.max(radius)
     if max_radius > TINY_RADIUS:
-        share = radius / max_radius
-        share = wp.cw_mul(share, wp.cw_mul(share, share))
-        share = share / (share[0] + share[1] + share[2] + share[3])
-        center = share[0] * a + share[1] * b + share[2] * c + share[3] * d
+        volume_shares = radius / max_radius
+        volume_shares = wp.cw_mul(volume_shares, wp.cw_mul(volume_shares, volume_shares))
+        volume_shares = volume_shares / (volume_shares[0] + volume_shares[1] + volume_shares[2] + volume_shares[3])
+        center = volume_shares[0] * a + volume_shares[1] * b + volume_shares[2] * c + volume_shares[3] * d
         size = max_radius + wp.max(
             wp.max(wp.max(wp.abs(a - center)), wp.max(wp.abs(b - center))),
             wp.max(wp.max(wp.abs(c - center)), wp.max(wp.abs(d - center))),
@@ -85,9 +85,9 @@ def _merge_clusters(
         c = (c - center) / size
         d = (d - center) / size
         squared_radii = wp.cw_mul(radius, radius) / (size * size)
-        moments = share[0] * wp.outer(a, a) + share[1] * wp.outer(b, b)
-        moments += share[2] * wp.outer(c, c) + share[3] * wp.outer(d, d)
-        moments += 0.2 * wp.dot(share, squared_radii) * wp.identity(n=3, dtype=wp.float32)
+        moments = volume_shares[0] * wp.outer(a, a) + volume_shares[1] * wp.outer(b, b)
+        moments += volume_shares[2] * wp.outer(c, c) + volume_shares[3] * wp.outer(d, d)
+        moments += 0.2 * wp.dot(volume_shares, squared_radii) * wp.identity(n=3, dtype=wp.float32)
         trace = wp.trace(moments)
         shadow = _ELLIPSOID_AREA_FACTOR * wp.sqrt(wp.max((trace * trace - wp.ddot(moments, moments)) / 6.0, 1.0e-30))
         squared_sum = wp.max(squared_radii[0] + squared_radii[1] + squared_radii[2] + squared_radii[3], 1.0e-15)
@@ -189,7 +189,7 @@ class Gradients:
 
 @functools.cache
 def make_add_to_node(lanes: int) -> wp.Function:
-    """Make the kernel function that adds a block's share to the gradients of a node."""
+    """Make the kernel function that adds those of a block to the gradients of a node."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     total = make_lane_functions(lanes).total
 
@@ -209,8 +209,8 @@ def make_add_to_node(lanes: int) -> wp.Function:
 
 
 @functools.cache
-def _make_blend_share(lanes: int) -> wp.Function:
-    """Make the kernel function of the share m of a cluster's sphere: d/E, τ → m, and its derivative by (D/E)²."""
+def _make_find_blend(lanes: int) -> wp.Function:
+    """Make the kernel function of the weight m of a cluster's sphere: d/E, τ → m, and its derivative by (D/E)²."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     fn = make_lane_functions(lanes)
     dot, smoothstep = fn.dot, fn.smoothstep
@@ -218,7 +218,7 @@ def _make_blend_share(lanes: int) -> wp.Function:
     MAX_DISTANCE2 = wp.constant(_MAX_DISTANCE2)
 
     @wp.func
-    def blend_share(relative_offset: Vectors, angle: float):
+    def find_blend(relative_offset: Vectors, angle: float):
         distance2 = dot(relative_offset, relative_offset)
         inverse2 = wp.cw_div(Lane(1.0), wp.min(wp.max(distance2, Lane(1.0)), Lane(MAX_DISTANCE2)))
         slope = 1.0 / (angle * angle * (1.0 - BLEND2))
@@ -226,7 +226,7 @@ def _make_blend_share(lanes: int) -> wp.Function:
         blend_slope = (6.0 * slope) * wp.cw_mul(wp.cw_mul(t, Lane(1.0) - t), wp.cw_mul(inverse2, inverse2))
         return smoothstep(t), blend_slope
 
-    return blend_share
+    return find_blend
 
 
 @functools.cache
@@ -249,33 +249,33 @@ def _make_offset_over_extent(lanes: int) -> wp.Function:
 
 
 @functools.cache
-def make_cluster_share(lanes: int) -> wp.Function:
-    """Make the kernel function of the share that a cluster's sphere has for a block of receivers."""
+def make_cluster_weight(lanes: int) -> wp.Function:
+    """Make the kernel function of the weight that a cluster's sphere has for a block of receivers."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    blend_share, offset_over_extent = _make_blend_share(lanes), _make_offset_over_extent(lanes)
+    find_blend, offset_over_extent = _make_find_blend(lanes), _make_offset_over_extent(lanes)
 
     @wp.func
-    def cluster_share(points: Vectors, batch: int, cluster: int, spheres: SphereClusters):
-        share = Lane(0.0)
+    def find_cluster_weight(points: Vectors, batch: int, cluster: int, spheres: SphereClusters):
+        cluster_weight = Lane(0.0)
         if cluster < spheres.extents.shape[1] and not is_skipped_partly(
             CLUSTER_SIZE * cluster, CLUSTER_SIZE * (cluster + 1), spheres
         ):
             relative_offset, _inverse_extent = offset_over_extent(points, batch, cluster, spheres)
-            blended_share, _slope = blend_share(relative_offset, spheres.merging_angle)
-            share = blended_share
-        return share
+            blend, _slope = find_blend(relative_offset, spheres.merging_angle)
+            cluster_weight = blend
+        return cluster_weight
 
-    return cluster_share
+    return find_cluster_weight
 
 
 @functools.cache
-def make_cluster_share_adjoint(lanes: int) -> wp.Function:
-    """Make the adjoint of the cluster share: m̄ → the adjoint of the offset to a cluster, added to the cluster's own.
+def make_cluster_weight_adjoint(lanes: int) -> wp.Function:
+    """Make the adjoint of the cluster weight: m̄ → the adjoint of the offset to a cluster, added to the cluster's own.
 
     With x = d/E and X² = |x|²:  X̄² = m' m̄,  d̄ = 2 x X̄² / E,  Ē = −2 X² X̄² / E.
     """
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
-    blend_share, offset_over_extent = _make_blend_share(lanes), _make_offset_over_extent(lanes)
+    find_blend, offset_over_extent = _make_find_blend(lanes), _make_offset_over_extent(lanes)
     add_to_node = make_add_to_node(lanes)
     fn = make_lane_functions(lanes)
     is_any_above, scale, dot, total = fn.is_any_above, fn.scale, fn.dot, fn.total
@@ -285,7 +285,7 @@ def make_cluster_share_adjoint(lanes: int) -> wp.Function:
         points: Vectors,
         batch: int,
         cluster: int,
-        adj_cluster_share: Lane,
+        adj_cluster_weight: Lane,
         spheres: SphereClusters,
         gradients: Gradients,
     ):
@@ -294,9 +294,9 @@ def make_cluster_share_adjoint(lanes: int) -> wp.Function:
             CLUSTER_SIZE * cluster, CLUSTER_SIZE * (cluster + 1), spheres
         ):
             relative_offset, inverse_extent = offset_over_extent(points, batch, cluster, spheres)
-            _cluster_share, slope = blend_share(relative_offset, spheres.merging_angle)
+            _cluster_weight, slope = find_blend(relative_offset, spheres.merging_angle)
             if is_any_above(slope, 0.0):
-                adj_offset = scale((2.0 * inverse_extent) * wp.cw_mul(adj_cluster_share, slope), relative_offset)
+                adj_offset = scale((2.0 * inverse_extent) * wp.cw_mul(adj_cluster_weight, slope), relative_offset)
                 add_to_node(adj_offset, Lane(0.0), batch, spheres.count + cluster, gradients)
                 if gradients.extents:
                     adj_extent = -total(dot(adj_offset, relative_offset))

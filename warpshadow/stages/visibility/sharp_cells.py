@@ -75,7 +75,7 @@ def _blend_sharp_cells(
     # in
     sharp_cells: wp.array3d(dtype=wp.float32),
     pairs: wp.array(dtype=wp.vec2i),
-    shares: wp.array(dtype=wp.float32),
+    spot_shares: wp.array(dtype=wp.float32),
     # out
     transmittance: wp.array3d(dtype=wp.float32),
 ):
@@ -85,7 +85,7 @@ def _blend_sharp_cells(
         cell = pairs[i][0]
         sharp_transmittance = sharp_cells[batch, receiver, pairs[i][1]]
         transmittance[batch, receiver, cell] = (
-            shares[i] * sharp_transmittance + (1.0 - shares[i]) * transmittance[batch, receiver, cell]
+            spot_shares[i] * sharp_transmittance + (1.0 - spot_shares[i]) * transmittance[batch, receiver, cell]
         )
 
 
@@ -95,7 +95,7 @@ def _blend_sharp_cells_adjoint(
     worker: int,
     # in
     pairs: wp.array(dtype=wp.vec2i),
-    shares: wp.array(dtype=wp.float32),
+    spot_shares: wp.array(dtype=wp.float32),
     # out
     adj_blended: wp.array3d(dtype=wp.float32),
     adj_sharp: wp.array3d(dtype=wp.float32),
@@ -106,21 +106,23 @@ def _blend_sharp_cells_adjoint(
         cell = pairs[i][0]
         slot = pairs[i][1]
         adj_cell = adj_blended[batch, receiver, cell]
-        adj_sharp[batch, receiver, slot] = adj_sharp[batch, receiver, slot] + shares[i] * adj_cell
-        adj_blended[batch, receiver, cell] = (1.0 - shares[i]) * adj_cell
+        adj_sharp[batch, receiver, slot] = adj_sharp[batch, receiver, slot] + spot_shares[i] * adj_cell
+        adj_blended[batch, receiver, cell] = (1.0 - spot_shares[i]) * adj_cell
 
 
 @cached_by_values
-def _find_pairs(slots: np.ndarray, shares: np.ndarray | None, device: wp.Device) -> tuple[wp.array, wp.array, bool]:
+def _find_pairs(
+    slots: np.ndarray, spot_shares: np.ndarray | None, device: wp.Device
+) -> tuple[wp.array, wp.array, bool]:
     """Sharp cells and their slots, the shares of their spots, and whether any is below 1."""
     cells = np.flatnonzero(slots >= 0)
-    spot_shares = np.ones(len(cells)) if shares is None else shares[cells]
+    pair_shares = np.ones(len(cells)) if spot_shares is None else spot_shares[cells]
     pairs = constant(np.stack([cells, slots[cells]], axis=1), wp.vec2i, device)
-    return pairs, constant(spot_shares.astype(np.float32), wp.float32, device), bool((spot_shares < 1).any())
+    return pairs, constant(pair_shares.astype(np.float32), wp.float32, device), bool((pair_shares < 1).any())
 
 
 def blend_sharp_cells(
-    transmittance: wp.array, sharp_cells: wp.array, slots: np.ndarray, shares: np.ndarray | None = None
+    transmittance: wp.array, sharp_cells: wp.array, slots: np.ndarray, spot_shares: np.ndarray | None = None
 ) -> wp.array:
     """Blend sharp cells into all; in place, unless the adjoint of ``transmittance`` needs it: call before anything
     reads it.
@@ -131,19 +133,19 @@ def blend_sharp_cells(
         transmittance: Transmittance of all cells, float32 of shape [batch, receiver, direction]; it may be changed.
         sharp_cells: That of :attr:`SharpCells.directions`, float32 of shape [batch, receiver, 16].
         slots: Of :class:`SharpCells`.
-        shares: σ, the share of each cell's light that its spot has [direction]; None for 1.
+        spot_shares: σ, the share of each cell's light that its spot has [direction]; None for 1.
     Returns:
         float32 of shape [batch, receiver, direction].
     Differentiable: transmittance, sharp_cells.
     """
     row_count = transmittance.shape[0] * transmittance.shape[1]
-    pairs, spot_shares, is_partial = _find_pairs(slots, shares, transmittance.device)
+    pairs, pair_shares, is_partial = _find_pairs(slots, spot_shares, transmittance.device)
     is_copied = is_partial and varies([transmittance])
     blended = transmittance
     if is_copied:
         blended = copied(transmittance)
         blended.grad = transmittance.grad  # which is changed in place, as the values else are
-    inputs, cost = [pairs, spot_shares], _RECEIVER_COST + _CELL_COST * pairs.size
+    inputs, cost = [pairs, pair_shares], _RECEIVER_COST + _CELL_COST * pairs.size
     return differentiable(
         lambda result: launch(
             _blend_sharp_cells, row_count, inputs=[sharp_cells, *inputs], outputs=[result], cost=cost

@@ -22,8 +22,8 @@ from warpshadow.stages.visibility.merging import (
     SphereClusters,
     is_skipped,
     make_add_to_node,
-    make_cluster_share,
-    make_cluster_share_adjoint,
+    make_cluster_weight,
+    make_cluster_weight_adjoint,
     merge_if_many,
 )
 
@@ -213,8 +213,8 @@ def sphere_view_type(lanes: int) -> Any:
         node: int
         offset: Vectors  # from the receivers to its center
         curvature: float  # 1/radius
-        cone: Cone  # its weight has the share as a factor
-        share: Lane  # that merging gives the sphere
+        cone: Cone  # its weight has that of merging as a factor
+        merge_weight: Lane  # that merging gives the sphere
 
     return SphereView
 
@@ -257,8 +257,8 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
     ReceiverLanes, SphereView = receiver_lanes_type(lanes), sphere_view_type(lanes)
     fn = make_lane_functions(lanes)
     is_any_above, offset, add, subtract = fn.is_any_above, fn.offset, fn.add, fn.subtract
-    cone, find_cluster_share = make_cone(lanes), make_cluster_share(lanes)
-    cluster_share_adjoint, add_to_node = make_cluster_share_adjoint(lanes), make_add_to_node(lanes)
+    cone, find_cluster_weight = make_cone(lanes), make_cluster_weight(lanes)
+    cluster_weight_adjoint, add_to_node = make_cluster_weight_adjoint(lanes), make_add_to_node(lanes)
 
     @wp.func(inline=lanes == 1)
     def traverse(receivers: ReceiverLanes, batch: int, spheres: SphereClusters, gradients: Gradients, task: Task):
@@ -279,18 +279,18 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                     receivers, spheres.cluster_bounds[batch, cluster], cluster * NODES_PER_CLUSTER, run_count, task
                 )
                 if count > 0:
-                    cluster_share = find_cluster_share(receivers.points, batch, cluster, spheres)
-                    adj_share = Lane(0.0)
+                    cluster_weight = find_cluster_weight(receivers.points, batch, cluster, spheres)
+                    adj_cluster_weight = Lane(0.0)
                     for item in range(NODES_PER_CLUSTER):
                         node = find_node(cluster, item, spheres.count, spheres.centers.shape[1])
-                        share = Lane(1.0) - cluster_share
+                        merge_weight = Lane(1.0) - cluster_weight
                         sign = float(-1.0)
                         if item == CLUSTER_SIZE:
-                            share = cluster_share
+                            merge_weight = cluster_weight
                             sign = 1.0
                         radius = float(0.0)
                         is_left_out = item < CLUSTER_SIZE and is_skipped(node, node + 1, spheres)
-                        if node >= 0 and not is_left_out and is_any_above(share, 0.0):
+                        if node >= 0 and not is_left_out and is_any_above(merge_weight, 0.0):
                             radius = spheres.radii[batch, node]
                         if radius > TINY_RADIUS:
                             sphere_view = SphereView()
@@ -300,20 +300,20 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                             sphere_view.curvature = 1.0 / radius
                             sphere_view.cone = cone(sphere_view.offset, sphere_view.curvature)
                             cone_weight = sphere_view.cone.weight
-                            sphere_view.cone.weight = wp.cw_mul(cone_weight, share)
-                            sphere_view.share = share
+                            sphere_view.cone.weight = wp.cw_mul(cone_weight, merge_weight)
+                            sphere_view.merge_weight = merge_weight
                             if wp.static(is_adjoint):
                                 adj_sphere = visit(receivers, sphere_view, count, task)
                                 if adj_sphere.is_any:
-                                    adj_share += sign * wp.cw_mul(adj_sphere.weight, cone_weight)
+                                    adj_cluster_weight += sign * wp.cw_mul(adj_sphere.weight, cone_weight)
                                     adj_receivers.points = subtract(adj_receivers.points, adj_sphere.offset)
                                     adj_receivers.normals = add(adj_receivers.normals, adj_sphere.normals)
                                     add_to_node(adj_sphere.offset, adj_sphere.radius, batch, node, gradients)
                             else:
                                 visit(receivers, sphere_view, count, task)
                     if wp.static(is_adjoint):
-                        adj_offset = cluster_share_adjoint(
-                            receivers.points, batch, cluster, adj_share, spheres, gradients
+                        adj_offset = cluster_weight_adjoint(
+                            receivers.points, batch, cluster, adj_cluster_weight, spheres, gradients
                         )
                         adj_receivers.points = subtract(adj_receivers.points, adj_offset)
         return adj_receivers
