@@ -289,10 +289,10 @@ def test_spheres_that_are_left_out_block_nothing(device):
     without = radii.copy()
     without[3:7] = 0
     expected = transmittance(points, normals, centers, without, cells.fibonacci(64), device)
-    got = transmittance(points, normals, centers, radii, cells.fibonacci(64), device, skip=(3, 7))
+    got = transmittance(points, normals, centers, radii, cells.fibonacci(64), device, skips=[(3, 7)])
     np.testing.assert_array_equal(got, expected)
-    with pytest.raises(ValueError, match="skip: got"):
-        transmittance(points, normals, centers, radii, cells.fibonacci(64), device, skip=(3, len(radii) + 1))
+    with pytest.raises(ValueError, match="skips: got"):
+        transmittance(points, normals, centers, radii, cells.fibonacci(64), device, skips=[(3, len(radii) + 1)])
 
 
 def test_concentric_and_hundreds_of_overlapping_spheres_are_finite(device):

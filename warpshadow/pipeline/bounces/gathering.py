@@ -188,7 +188,7 @@ class BounceGatherer:
             transmittance.directions,
             softness=softness,
             merging=self._visibility.merging,
-            skip=outgoing.proxies.span_of(group.body),
+            skips=(outgoing.proxies.span_of(group.body),),
             clusters=proxies.clusters if is_same else None,
             tangent_planes=proxies.tangent_planes,
             addend=others,

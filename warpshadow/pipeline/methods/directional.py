@@ -158,7 +158,8 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         self, group: Group, horizon_normals: wp.array | None, projected_light: ProjectedCells
     ) -> wp.array:
         arguments, scales = (group.points, horizon_normals, group.centers, group.radii), self._scales
-        block = functools.partial(directional.transmittance, *arguments, skip=group.skip, clusters=group.clusters)
+        among = {"spans": group.spans, "skips": group.skips, "clusters": group.clusters}
+        block = functools.partial(directional.transmittance, *arguments, **among)
         transmittance = block(projected_light.blocking_directions, **scales(1.0))
         if projected_light.sharp_cells is None:
             return transmittance

@@ -73,7 +73,8 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
         if not points.size or (cached_rows is None and not radii.shape[1]):
             return HarmonicVisibility(None)
         if radii.shape[1]:
-            log = self._logs(points, group.normals, group.centers, radii, skip=group.skip, clusters=group.clusters)
+            among = {"spans": group.spans, "skips": group.skips, "clusters": group.clusters}
+            log = self._logs(points, group.normals, group.centers, radii, **among)
         else:
             log = zeros((*points.shape, self._order**2), dtype=wp.float32, device=points.device)
         if cached_rows is not None:

@@ -23,8 +23,8 @@ from warpshadow.stages.convex.convex_blockers import PlacedParts
 from warpshadow.stages.light.cached_cells import CachedRows
 from warpshadow.stages.planes.fronts import NearestBlockers, PlaneFronts, find_body_sides, find_fronts
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers
+from warpshadow.stages.receivers.body_spans import Span
 from warpshadow.stages.receivers.find import Receivers
-from warpshadow.stages.receivers.sample_receivers import Span
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
@@ -96,7 +96,8 @@ class Group:
     planes: GroupPlanes | None = None  # bodies that block as planes; None without any
     convex_parts_around: GroupConvexParts | None = None  # bodies that block as convex parts; None without any
     nearest_blockers: NearestBlockers | None = None  # None where receivers are not patch samples
-    skip: tuple[int, int] = (0, 0)  # spheres that do not block: the first, and the one after the last
+    skips: tuple[tuple[int, int], ...] = ()  # spheres that do not block: the first, and the one after the last
+    spans: tuple[Span, ...] = ()
     clusters: ClusterTree | None = None  # of the spheres, where they are found already
     footprints: wp.array | None = None  # [batch, receiver] vec3, areas for which they stand; None for points
 
@@ -344,7 +345,7 @@ def _groups_that_move(
             group = replace(group, footprints=cut(receivers.footprints, span.first, span.end))
         if others is spheres:
             clusters = clusters or find_clusters(*spheres, blockers.merging)
-            group = replace(group, skip=skip, clusters=clusters)
+            group = replace(group, skips=(skip,), clusters=clusters)
         if span.body >= 0:
             receiver_body = ReceiverBody(
                 span,

@@ -6,13 +6,17 @@ spheres are visited. A method supplies culling and a visit; the traversal is gen
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import warp as wp
 
-from warpshadow.device.lanes import block_count, lane_count, lane_type, make_lane_functions, vectors_type
+from warpshadow.device.constants import constant
+from warpshadow.device.lanes import lane_count, lane_type, make_lane_functions, vectors_type
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.stages.receivers.body_spans import ReceiverSpans, Span, find_blocks, find_span
 from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres, cone_type, make_cone
 from warpshadow.stages.visibility.merging import (
     CLUSTER_SIZE,
@@ -21,6 +25,7 @@ from warpshadow.stages.visibility.merging import (
     Gradients,
     SphereClusters,
     is_skipped,
+    is_skipped_partly,
     make_add_to_node,
     make_cluster_share,
     make_cluster_share_adjoint,
@@ -119,6 +124,8 @@ class TraversalInputs:
     points: wp.array2d(dtype=wp.vec3)
     normals: wp.array2d(dtype=wp.vec3)  # empty where there is no horizon
     footprints: wp.array2d(dtype=wp.vec3)  # empty where receivers are points
+    spans: ReceiverSpans
+    skips: wp.array(dtype=wp.vec2i)  # [span] spheres that are left out: the first, and the one after the last
     spheres: SphereClusters
 
 
@@ -139,7 +146,8 @@ def prepare_traversal(
     cell_radius: float,
     *,
     merging: float,
-    skip: tuple[int, int] = (0, 0),
+    spans: Sequence[Span] = (),
+    skips: Sequence[tuple[int, int]] = (),
     clusters: ClusterTree | None = None,
 ) -> SphereTraversal:
     """Put receivers together with spheres and their clusters.
@@ -149,7 +157,8 @@ def prepare_traversal(
         centers, radii: Spheres, [batch, sphere].
         cell_radius: Radius of a cell [rad].
         merging: τ in cell radii, 0 for never.
-        skip: Spheres that are left out: the first, and the one after the last.
+        spans: Of the receivers; () for one of all.
+        skips: Spheres that each span leaves out: the first, and the one after the last; () for none.
         clusters: Of these spheres, where they are found already.
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii.
@@ -157,17 +166,20 @@ def prepare_traversal(
     """
     check_spheres(points, normals, centers, radii)
     count, lanes = radii.shape[1], lane_count(points.device)
-    if not 0 <= skip[0] <= skip[1] <= count:
-        raise ValueError(f"skip: got {skip!r}, expected a first and an end of {count} spheres")
+    skips = skips or ((0, 0),) * max(len(spans), 1)
+    for skip in skips:
+        if not 0 <= skip[0] <= skip[1] <= count:
+            raise ValueError(f"skips: got {skip!r}, expected a first and an end of {count} spheres")
     nodes, *bounds = find_clusters(centers, radii, merging) if clusters is None else clusters
     inputs = TraversalInputs()
     inputs.points, inputs.normals = points, normals
+    inputs.spans, block_count = find_blocks(spans, points.shape[1], lanes, points.device)
+    inputs.skips = constant(np.array(skips, np.int32), wp.vec2i, points.device)
     spheres = inputs.spheres  # filled in place: a struct that is assigned is copied field by field
     spheres.centers, spheres.radii, spheres.extents = nodes
     spheres.count, spheres.merging_angle = count, merging * cell_radius
-    spheres.skip_begin, spheres.skip_end = skip
     spheres.cluster_bounds, spheres.run_bounds = bounds
-    return SphereTraversal(inputs, nodes, lanes, points.shape[0] * block_count(points.shape[1], lanes))
+    return SphereTraversal(inputs, nodes, lanes, points.shape[0] * block_count)
 
 
 @functools.cache
@@ -180,24 +192,25 @@ def receiver_lanes_type(lanes: int) -> Any:
         points: Vectors
         normals: Vectors  # 0 where there is no horizon
         footprints: Lane  # areas as the light sees them, 0 where they are points
+        skip: wp.vec2i  # spheres that they leave out: the first, and the one after the last
 
     return ReceiverLanes
 
 
 @functools.cache
 def make_load_receivers(has_horizon: bool, lanes: int) -> wp.Function:
-    """Make the kernel function that loads receivers without footprints: inputs, row → instance, block, receivers."""
+    """Make the kernel function that loads receivers without footprints: inputs, row → block, receivers."""
     Lane, Vectors, ReceiverLanes = lane_type(lanes), vectors_type(lanes), receiver_lanes_type(lanes)
-    fn = make_lane_functions(lanes)
-    find_block, load = fn.find_block, fn.load
+    load = make_lane_functions(lanes).load
 
     @wp.func(inline=True)
     def load_receivers(inputs: TraversalInputs, row: int):
-        batch, block = find_block(row, inputs.points.shape[1])
+        block = find_span(inputs.spans, row)
         normals = Vectors()
         if wp.static(has_horizon):
-            normals = load(inputs.normals[batch], block)
-        return batch, block, ReceiverLanes(load(inputs.points[batch], block), normals, Lane())
+            normals = load(inputs.normals[block.batch][block.first : block.end], block.number)
+        points = load(inputs.points[block.batch][block.first : block.end], block.number)
+        return block, ReceiverLanes(points, normals, Lane(), inputs.skips[block.span])
 
     return load_receivers
 
@@ -268,7 +281,7 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
             begin = run * CLUSTERS_PER_RUN
             end = wp.min(begin + CLUSTERS_PER_RUN, spheres.cluster_bounds.shape[1])
             run_count = int(0)
-            if not is_skipped(begin * CLUSTER_SIZE, wp.min(end * CLUSTER_SIZE, spheres.count), spheres):
+            if not is_skipped(begin * CLUSTER_SIZE, wp.min(end * CLUSTER_SIZE, spheres.count), receivers.skip):
                 run_count = cull(
                     receivers, spheres.run_bounds[batch, run], begin * NODES_PER_CLUSTER, ALL_BUNDLES, task
                 )
@@ -279,7 +292,12 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                     receivers, spheres.cluster_bounds[batch, cluster], cluster * NODES_PER_CLUSTER, run_count, task
                 )
                 if count > 0:
-                    cluster_share = find_cluster_share(receivers.points, batch, cluster, spheres)
+                    is_merged = cluster < spheres.extents.shape[1] and not is_skipped_partly(
+                        CLUSTER_SIZE * cluster, CLUSTER_SIZE * (cluster + 1), receivers.skip
+                    )
+                    cluster_share = Lane(0.0)
+                    if is_merged:
+                        cluster_share = find_cluster_share(receivers.points, batch, cluster, spheres)
                     adj_share = Lane(0.0)
                     for item in range(NODES_PER_CLUSTER):
                         node = find_node(cluster, item, spheres.count, spheres.centers.shape[1])
@@ -289,7 +307,7 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                             share = cluster_share
                             sign = 1.0
                         radius = float(0.0)
-                        is_left_out = item < CLUSTER_SIZE and is_skipped(node, node + 1, spheres)
+                        is_left_out = item < CLUSTER_SIZE and is_skipped(node, node + 1, receivers.skip)
                         if node >= 0 and not is_left_out and is_any_above(share, 0.0):
                             radius = spheres.radii[batch, node]
                         if radius > TINY_RADIUS:
@@ -312,10 +330,11 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                             else:
                                 visit(receivers, sphere_view, count, task)
                     if wp.static(is_adjoint):
-                        adj_offset = cluster_share_adjoint(
-                            receivers.points, batch, cluster, adj_share, spheres, gradients
-                        )
-                        adj_receivers.points = subtract(adj_receivers.points, adj_offset)
+                        if is_merged:  # noqa: SIM102  (the forward kernel has none of this)
+                            adj_offset = cluster_share_adjoint(
+                                receivers.points, batch, cluster, adj_share, spheres, gradients
+                            )
+                            adj_receivers.points = subtract(adj_receivers.points, adj_offset)
         return adj_receivers
 
     return traverse
