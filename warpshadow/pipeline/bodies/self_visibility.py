@@ -19,6 +19,7 @@ from warpshadow import check
 from warpshadow.assets.cache import Unfinished, cache_path, load_or_compute
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.batch import cut
+from warpshadow.device.constants import constant
 from warpshadow.device.memory import from_numpy
 from warpshadow.device.progress import announce
 from warpshadow.device.tape import unrecorded
@@ -29,18 +30,19 @@ from warpshadow.spheres.normalized_mesh import normalize
 from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.rays.ray_packets import FaceTree, build_face_tree
-from warpshadow.stages.receivers.body_spans import Span
+from warpshadow.stages.receivers.body_spans import Span, relative_spans
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.self_visibility.buried import find_buried, find_dilation
-from warpshadow.stages.self_visibility.gather import gather_self_transmittance
+from warpshadow.stages.self_visibility.gather import BodyTables, gather_self_transmittance
 from warpshadow.stages.self_visibility.lookup import (
-    ResamplingKernels,
+    BodyKernels,
     ResamplingWeights,
-    find_resampling_kernels,
+    find_body_kernels,
     find_resampling_weights,
 )
 from warpshadow.stages.self_visibility.probes import (
     ProbeTable,
+    ProbeTables,
     ProbeWeights,
     VisibilityProbes,
     find_probes,
@@ -73,21 +75,25 @@ _OF_MESHES: weakref.WeakKeyDictionary[Mesh, dict[tuple[str, bool, str], object]]
 
 
 class SelfVisibilityLookup(NamedTuple):
-    """Self-visibility lookups of a body's receivers."""
+    """Self-visibility lookups of receivers of some bodies."""
 
-    rows: VisibilityRows
-    lookup: ResamplingWeights
-    kernels: ResamplingKernels
+    bodies: tuple[int, ...]
+    tables: BodyTables
+    weights: ResamplingWeights
+    kernels: BodyKernels
     rays: tuple[RayProbes, wp.array] | None = None  # for a sun, and the rotations; None where it is looked up, too
 
     @property
     def turned(self) -> wp.array:
         """The part that depends on the rotations, of shape [batch, …]."""
-        return self.lookup.weights
+        return self.weights.weights
 
-    def transmittance(self, normals: wp.array, weights: ProbeWeights) -> wp.array:
-        """Transmittance of receivers past their body, [batch, receiver, cell]."""
-        return gather_self_transmittance(normals, weights, self.lookup, self.kernels, self.rows)
+    def transmittance(self, normals: wp.array, weights: ProbeWeights, spans: tuple[Span, ...]) -> wp.array:
+        """Transmittance of receivers in spans past their bodies, [batch, receiver, cell]."""
+        table_of_span = [self.bodies.index(span.body) for span in spans]
+        return gather_self_transmittance(
+            normals, weights, self.weights, self.kernels, self.tables, spans, table_of_span
+        )
 
 
 class SelfVisibilityLobes(NamedTuple):
@@ -106,6 +112,10 @@ class SelfVisibilityLobes(NamedTuple):
         return self_visibility_lobes(self.lobes, weights, self.turn, order=order, bands=bands)
 
 
+SelfLookup = SelfVisibilityLookup | SelfVisibilityLobes
+"""Self-visibility of receivers, in cells or in bands."""
+
+
 class SelfVisibility:
     """Traced self-visibility of the bodies, each in its own frame.
 
@@ -118,9 +128,10 @@ class SelfVisibility:
     def __init__(self, merged_scene: MergedScene, samples_receive: np.ndarray, *, progress: bool = False):
         self._merged_scene, self._samples_receive, self._progress = merged_scene, samples_receive, progress
         self._probes: dict[int, VisibilityProbes] = {}
-        self._tables: dict[int, ProbeTable] = {}
+        self._tables: dict[tuple[int, ...], ProbeTables] = {}
         self._rows: dict[int, VisibilityRows] = {}
         self._lobes: dict[tuple[int, int], wp.array] = {}
+        self._body_tables: dict[tuple[int, ...], BodyTables] = {}
 
     # ----------------------------------------------------------------------------------- kind of self-shadow
 
@@ -182,33 +193,44 @@ class SelfVisibility:
             cached[key] = find()
         return cached[key]
 
-    def probe_weights(self, receivers: Receivers, span: Span) -> ProbeWeights:
-        """Where receivers of a body lie among its probes. Differentiable: barycentrics of samples."""
+    def probe_weights(self, receivers: Receivers, spans: tuple[Span, ...]) -> ProbeWeights:
+        """Where receivers lie among the probes of their bodies. Differentiable: barycentrics of samples.
+
+        Args:
+            receivers: All of them.
+            spans: Some that follow each other, all at vertices or all at samples.
+        """
         assert receivers.vertices is not None
-        table, first, end = self._table(span.body), span.first, span.end
-        vertex_count = receivers.vertices.size
+        bodies = tuple(dict.fromkeys(span.body for span in spans))
+        first, end, vertex_count = spans[0].first, spans[-1].end, receivers.vertices.size
+        places = relative_spans(spans), [bodies.index(span.body) for span in spans]
         if first < vertex_count:
-            return table.of_vertices(receivers.vertices[first:end])
+            return self._tables_of(bodies).of_vertices(receivers.vertices[first:end], *places)
         fragments, first, end = receivers.sample_fragments, first - vertex_count, end - vertex_count
         assert fragments is not None
-        return table.of_samples(Fragments(cut(fragments.face_ids, first, end), cut(fragments.barycentrics, first, end)))
+        seen = Fragments(cut(fragments.face_ids, first, end), cut(fragments.barycentrics, first, end))
+        return self._tables_of(bodies).of_samples(seen, *places)
 
     def probe_weights_of(self, body: int, vertices: np.ndarray) -> ProbeWeights:
         """Where vertices of a body lie among its probes; backs are numbered after the last vertex."""
-        return self._table(body).of_vertices(from_numpy(vertices, dtype=wp.int32, device=self._merged_scene.device))
+        on_device = from_numpy(vertices, dtype=wp.int32, device=self._merged_scene.device)
+        return self._tables_of((body,)).of_vertices(on_device)
+
+    def _tables_of(self, bodies: tuple[int, ...]) -> ProbeTables:
+        if bodies not in self._tables:
+            merged_scene, tables = self._merged_scene, tuple(map(self._table, bodies))
+            on_device = wp.array(list(tables), dtype=ProbeTable, device=merged_scene.device)
+            counts = int(merged_scene.first_vertex[-1]), int(merged_scene.first_face[-1])
+            self._tables[bodies] = ProbeTables(tables, on_device, *counts)
+        return self._tables[bodies]
 
     def _table(self, body: int) -> ProbeTable:
-        if body not in self._tables:
-            merged_scene, probes = self._merged_scene, self.probes(body)
-            self._tables[body] = ProbeTable(
-                int(merged_scene.first_vertex[body]),
-                int(merged_scene.first_vertex[-1]),
-                int(merged_scene.first_face[body]),
-                int(merged_scene.first_face[-1]),
-                len(probes.positions),
-                from_numpy(probes.pieces, dtype=wp.vec4i, device=merged_scene.device),
-            )
-        return self._tables[body]
+        merged_scene, probes = self._merged_scene, self.probes(body)
+        table = ProbeTable()
+        table.first_vertex, table.first_face = int(merged_scene.first_vertex[body]), int(merged_scene.first_face[body])
+        table.probe_count = len(probes.positions)
+        table.pieces = constant(probes.pieces, wp.vec4i, merged_scene.device)
+        return table
 
     # ----------------------------------------------------------------------------- tables and lookups
 
@@ -228,16 +250,16 @@ class SelfVisibility:
             has_sun: Whether there are sun cells, to which receivers of some bodies send rays.
         """
         self._announce(bodies)
-        result = {}
-        for body in bodies:
-            if not self._merged_scene.is_flat[body]:
-                rows = self.rows(body)
-                kernels = find_resampling_kernels(directions, half_angles, rows.ray_count, rotations.device)
-                rays = (self._ray_probes(body), rotations) if has_sun and self._sends_rays(body) else None
-                result[body] = SelfVisibilityLookup(
-                    rows, find_resampling_weights(rotations, body, kernels), kernels, rays
-                )
-        return result
+        curved = tuple(body for body in bodies if not self._merged_scene.is_flat[body])
+        if curved not in self._body_tables:
+            self._body_tables[curved] = BodyTables.of_rows(tuple(map(self.rows, curved)))
+        tables = self._body_tables[curved]
+        ray_counts = tuple(rows.ray_count for rows in tables.rows)
+        kernels = find_body_kernels(curved, ray_counts, directions, half_angles, rotations.device)
+        lookup = SelfVisibilityLookup(curved, tables, find_resampling_weights(rotations, kernels), kernels)
+        sends_rays = [body for body in curved if has_sun and self._sends_rays(body)]
+        of_rays = {body: lookup._replace(rays=(self._ray_probes(body), rotations)) for body in sends_rays}
+        return dict.fromkeys(curved, lookup) | of_rays
 
     def _ray_probes(self, body: int) -> RayProbes:
         """Where rays for a sun start."""

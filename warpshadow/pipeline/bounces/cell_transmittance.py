@@ -53,7 +53,7 @@ def find_cell_transmittance(
     else:
         directions, transmittance_self = HARMONIC_GATHER_CELLS, None
         transmittance_nonplanar = _transmittance(method, group, merged_scene.nonplanar_bodies, spheres, directions)
-    body = group.receiver_body
+    body = group.receiver_bodies
     if transmittance_self is None and body is not None and not (body.is_solid or merged_scene.is_flat[body.number]):
         transmittance_self = _transmittance(method, group, [body.number], spheres, directions)
     if transmittance_nonplanar is None:

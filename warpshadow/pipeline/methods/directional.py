@@ -158,8 +158,9 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         self, group: Group, horizon_normals: wp.array | None, projected_light: ProjectedCells
     ) -> wp.array:
         arguments, scales = (group.points, horizon_normals, group.centers, group.radii), self._scales
-        among = {"spans": group.spans, "skips": group.skips, "clusters": group.clusters}
-        block = functools.partial(directional.transmittance, *arguments, **among)
+        block = functools.partial(
+            directional.transmittance, *arguments, body_spans=group.spans, skips=group.skips, clusters=group.clusters
+        )
         transmittance = block(projected_light.blocking_directions, **scales(1.0))
         if projected_light.sharp_cells is None:
             return transmittance
@@ -218,10 +219,10 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if group.self_blocking_parts is not None:
             coverages = self._coverages(group.self_coverage, projected_light)
             return self._past_coverages(None, coverages, None, projected_light)
-        transmittance_self, receiver_body = group.looked_up_transmittance(), group.receiver_body
-        if transmittance_self is None or receiver_body is None:
+        transmittance_self, bodies = group.looked_up_transmittance(), group.receiver_bodies
+        if transmittance_self is None or bodies is None or not isinstance(bodies.lookup, SelfVisibilityLookup):
             return None
-        rays = receiver_body.lookup.rays
+        rays = bodies.lookup.rays
         if rays is None or projected_light.sun is None:
             return transmittance_self
         if transmittance_self.requires_grad:
@@ -229,9 +230,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
                 'self_shadows: got "rays" where a pose or a camera has a gradient, which rays under a sun do not '
                 'have, expected "traced" or "spheres"'
             )
-        of_sun = trace_sun_cells(
-            rays[0], receiver_body.probe_weights, rays[1], receiver_body.number, projected_light.sun
-        )
+        of_sun = trace_sun_cells(rays[0], bodies.probe_weights, rays[1], bodies.number, projected_light.sun)
         return blend_sharp_cells(transmittance_self, of_sun, projected_light.sun.slots)
 
     def transfer(self, visibility: CellVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:

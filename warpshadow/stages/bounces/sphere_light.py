@@ -408,7 +408,7 @@ def sphere_light(
     *,
     softness: float = SOFTNESS,
     merging: float = MERGING,
-    spans: Sequence[Span] = (),
+    body_spans: Sequence[Span] = (),
     skips: Sequence[tuple[int, int]] = (),
     clusters: ClusterTree | None = None,
     tangent_planes: TangentPlanes | None = None,
@@ -417,7 +417,7 @@ def sphere_light(
     """Light that proxies send to receivers, through the cells that they block, added to other light.
 
     Args:
-        points, normals, centers, radii, directions, softness, merging, spans, skips, clusters: As
+        points, normals, centers, radii, directions, softness, merging, body_spans, skips, clusters: As
             for :func:`warpshadow.stages.visibility.directional.transmittance`.
         proxy_radiance: Light and area that proxies, clusters included, show towards cells, vec4 of shape [batch, proxy,
             direction], from :func:`.proxy_radiance.find_proxy_radiance`.
@@ -438,7 +438,7 @@ def sphere_light(
     """
     cells = make_cells(directions, softness, points.device)
     arguments = points, normals, centers, radii, cell_radius(len(directions))
-    traversal = prepare_traversal(*arguments, merging=merging, spans=spans, skips=skips, clusters=clusters)
+    traversal = prepare_traversal(*arguments, merging=merging, body_spans=body_spans, skips=skips, clusters=clusters)
     equations, tolerances = (None, None) if tangent_planes is None else tangent_planes
     common_batch(
         {

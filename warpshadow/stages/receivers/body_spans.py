@@ -30,6 +30,11 @@ def spans_of(bodies: np.ndarray) -> tuple[Span, ...]:
     return tuple(Span(int(bodies[first]), first, end) for first, end in itertools.pairwise(bounds))
 
 
+def relative_spans(spans: Sequence[Span]) -> tuple[Span, ...]:
+    """Count the receivers of spans from the first of them on."""
+    return tuple(span._replace(first=span.first - spans[0].first, end=span.end - spans[0].first) for span in spans)
+
+
 @wp.struct
 class ReceiverSpans:
     """Spans that follow each other; the last item of both arrays is the end of the last span."""
@@ -54,8 +59,19 @@ def find_span(spans: ReceiverSpans, row: int):
     """The block of a row, where the blocks of all instances follow each other."""
     batch, number = split_row(row, spans.first_blocks[spans.first_blocks.shape[0] - 1])
     span = wp.lower_bound(spans.first_blocks, number + 1) - 1
-    first = spans.first_receivers[span]
-    return ReceiverBlock(batch, span, first, spans.first_receivers[span + 1], number - spans.first_blocks[span])
+    block = ReceiverBlock()
+    block.batch = batch
+    block.span = span
+    block.first = spans.first_receivers[span]
+    block.end = spans.first_receivers[span + 1]
+    block.number = number - spans.first_blocks[span]
+    return block
+
+
+@wp.func
+def span_of_receiver(spans: ReceiverSpans, receiver: int):
+    """The span of a receiver of any instance."""
+    return wp.lower_bound(spans.first_receivers, receiver + 1) - 1
 
 
 class SpanBlocks(NamedTuple):

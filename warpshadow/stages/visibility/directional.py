@@ -274,7 +274,7 @@ def transmittance(
     *,
     softness: float = SOFTNESS,
     merging: float = MERGING,
-    spans: Sequence[Span] = (),
+    body_spans: Sequence[Span] = (),
     skips: Sequence[tuple[int, int]] = (),
     clusters: ClusterTree | None = None,
     footprints: wp.array | None = None,
@@ -291,7 +291,7 @@ def transmittance(
         softness: κ, half-width of the falloff in cell radii.
         merging: τ, the half-angle in cell radii under which four spheres that follow each other are seen as one (see
             :mod:`warpshadow.stages.visibility.merging`), where there are 512 or more; 0 for never.
-        spans: Of the receivers, by body; () for one of all.
+        body_spans: Of the receivers, by body; () for one of all.
         skips: Spheres that each span leaves out: the first, and the one after the last; () for none.
         clusters: Of these spheres, from :func:`.traversal.find_clusters`, where they are found already.
         footprints: Areas f² for which receivers stand, as vectors along the normals of their planes or against them
@@ -308,7 +308,7 @@ def transmittance(
     cells = make_cells(directions, softness, points.device, footprints is not None)
     arguments = points, normals, centers, radii, cell_radius(len(directions))
     inputs, nodes, lanes, row_count = prepare_traversal(
-        *arguments, merging=merging, spans=spans, skips=skips, clusters=clusters
+        *arguments, merging=merging, body_spans=body_spans, skips=skips, clusters=clusters
     )
     if footprints is not None:
         check.shape("footprints", footprints.shape, points.shape)

@@ -243,7 +243,7 @@ def accumulate(
     order: int = 8,
     log: str = "eigen",
     merging: float = MERGING,
-    spans: Sequence[Span] = (),
+    body_spans: Sequence[Span] = (),
     skips: Sequence[tuple[int, int]] = (),
     clusters: ClusterTree | None = None,
 ) -> wp.array:
@@ -261,7 +261,7 @@ def accumulate(
         log: "eigen" (Ren et al. 2006, accurate where spheres overlap) or "cap" (the paper's).
         merging: τ, the half-angle under which four spheres that follow each other are seen as one, where there are 512
             or more, in radii 2/order of a cell for each coefficient; 0 for never.
-        spans, skips, clusters: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
+        body_spans, skips, clusters: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
     Returns:
         Log-visibility, float32 of shape [batch, receiver, order²], index l² + l + m.
     Raises:
@@ -272,7 +272,7 @@ def accumulate(
     check.choice("log", log, LOGS)
     arguments = points, normals, centers, radii, cell_radius(order**2)
     inputs, nodes, lanes, row_count = prepare_traversal(
-        *arguments, merging=merging, spans=spans, skips=skips, clusters=clusters
+        *arguments, merging=merging, body_spans=body_spans, skips=skips, clusters=clusters
     )
     traits = order, normals is not None, lanes
     return launch_with_adjoint(

@@ -146,7 +146,7 @@ def prepare_traversal(
     cell_radius: float,
     *,
     merging: float,
-    spans: Sequence[Span] = (),
+    body_spans: Sequence[Span] = (),
     skips: Sequence[tuple[int, int]] = (),
     clusters: ClusterTree | None = None,
 ) -> SphereTraversal:
@@ -157,7 +157,7 @@ def prepare_traversal(
         centers, radii: Spheres, [batch, sphere].
         cell_radius: Radius of a cell [rad].
         merging: τ in cell radii, 0 for never.
-        spans: Of the receivers; () for one of all.
+        body_spans: Of the receivers; () for one of all.
         skips: Spheres that each span leaves out: the first, and the one after the last; () for none.
         clusters: Of these spheres, where they are found already.
     Raises:
@@ -166,14 +166,14 @@ def prepare_traversal(
     """
     check_spheres(points, normals, centers, radii)
     count, lanes = radii.shape[1], lane_count(points.device)
-    skips = skips or ((0, 0),) * max(len(spans), 1)
+    skips = skips or ((0, 0),) * max(len(body_spans), 1)
     for skip in skips:
         if not 0 <= skip[0] <= skip[1] <= count:
             raise ValueError(f"skips: got {skip!r}, expected a first and an end of {count} spheres")
     nodes, *bounds = find_clusters(centers, radii, merging) if clusters is None else clusters
     inputs = TraversalInputs()
     inputs.points, inputs.normals = points, normals
-    inputs.spans, block_count = find_blocks(spans, points.shape[1], lanes, points.device)
+    inputs.spans, block_count = find_blocks(body_spans, points.shape[1], lanes, points.device)
     inputs.skips = constant(np.array(skips, np.int32), wp.vec2i, points.device)
     spheres = inputs.spheres  # filled in place: a struct that is assigned is copied field by field
     spheres.centers, spheres.radii, spheres.extents = nodes
@@ -329,8 +329,8 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                                     add_to_node(adj_sphere.offset, adj_sphere.radius, batch, node, gradients)
                             else:
                                 visit(receivers, sphere_view, count, task)
-                    if wp.static(is_adjoint):
-                        if is_merged:  # noqa: SIM102  (the forward kernel has none of this)
+                    if wp.static(is_adjoint):  # noqa: SIM102  (the forward kernel has none of this)
+                        if is_merged:
                             adj_offset = cluster_share_adjoint(
                                 receivers.points, batch, cluster, adj_share, spheres, gradients
                             )
