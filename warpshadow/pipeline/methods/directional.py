@@ -106,7 +106,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
             of_spheres = self._past_spheres(group, horizon_normals, projected_light)
             past_spheres = of_spheres if past_spheres is None else multiply_transmittances(past_spheres, of_spheres)
         if points.size and group.convex_parts_around is not None:
-            cover = functools.partial(group.convex_parts_around.coverage, points, horizon_normals)
+            cover = functools.partial(group.coverage_around, horizon_normals)
             parts = self._coverages(cover, projected_light)
         # planes multiply their share in later; only bounces need the product without them, too
         if group.is_blocked_by_planes and not self.merged_scene.scene.bounces:

@@ -93,7 +93,9 @@ class Group:
     planes: GroupPlanes | None = None  # bodies that block as planes; None without any
     convex_parts_around: GroupConvexParts | None = None  # bodies that block as convex parts; None without any
     nearest_blockers: NearestBlockers | None = None  # None where receivers are not patch samples
-    self_spheres: Mapping[int, tuple[int, int]] = field(default_factory=dict)  # of bodies that do not block their own light by spheres
+    self_spheres: Mapping[int, tuple[int, int]] = field(
+        default_factory=dict
+    )  # of bodies that do not block their own light by spheres
     clusters: ClusterTree | None = None  # of the spheres, where they are found already
     footprints: wp.array | None = None  # [batch, receiver] vec3, areas for which they stand; None for points
 
@@ -126,6 +128,13 @@ class Group:
         """Coverage of cells by them."""
         assert self.self_blocking_parts is not None
         return self.self_blocking_parts.coverage(self.points, self.normals, directions, radius)
+
+    def coverage_around(
+        self, horizon_normals: wp.array | None, directions: np.ndarray, radius: float | None = None
+    ) -> wp.array:
+        """Coverage of cells by convex parts of other bodies."""
+        assert self.convex_parts_around is not None
+        return self.convex_parts_around.coverage(self.points, horizon_normals, directions, radius, self.spans)
 
     def looked_up_transmittance(self) -> wp.array | None:
         """Transmittance past the receivers' own body, looked up, [batch, receiver, cell]; None without rows."""
@@ -273,10 +282,10 @@ class Blockers(NamedTuple):
     def convex_parts_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupConvexParts | None:
         """Convex parts of bodies around receivers of one body: all that block, or some."""
         bodies = self.blocker_kinds.convex
-        chosen, skip = _choose_blocking(bodies, body, of_bodies)
+        chosen, _ = _choose_blocking(bodies, body, of_bodies)
         if self.placed_parts is None or not chosen:
             return None
-        return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed_parts, skip)
+        return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed_parts, bodies)
 
     def self_blocking_parts(self, body: int) -> GroupConvexParts | None:
         """The convex parts of a body, where they block its own light: one alone does not."""
@@ -363,12 +372,14 @@ def _groups_that_move(
     def kind_of(span: Span) -> tuple[Hashable, ...]:
         """All in which receivers of a group are the same."""
         body = span.body
-        is_alone = by_body or body in (*kinds.planes, *kinds.convex)
+        is_alone = by_body or body in kinds.planes or blockers.self_blocking_parts(body) is not None
+        has_parts = blockers.convex_parts_around(body) is not None
         others = None if self_spheres.get(body) == (0, spheres[1].shape[1]) else spheres
         lookup, is_glossy = IdentityKey(self_lookups.get(body)), body >= 0 and merged_scene.is_glossy[body]
-        return span.first < vertex_count, lookup, others is spheres, is_glossy, body if is_alone else body >= 0
+        kind = lookup, has_parts, body in kinds.solids, is_glossy, body if is_alone else body >= 0
+        return span.first < vertex_count, others is spheres, *kind
 
-    for (is_at_vertices, _, has_spheres, *_), consecutive in itertools.groupby(receivers.spans, kind_of):
+    for (is_at_vertices, has_spheres, *_), consecutive in itertools.groupby(receivers.spans, kind_of):
         spans = tuple(consecutive)
         body, first, end = spans[0].body, spans[0].first, spans[-1].end
         points_and_normals = receivers.points, receivers.normals

@@ -8,6 +8,7 @@ seen at a slant: these are taken off. :mod:`warpshadow.stages.joint_coverage` te
 """
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,14 +16,8 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, instance_in
-from warpshadow.device.lanes import (
-    block_count,
-    lane_count,
-    lane_type,
-    make_lane_functions,
-    module_options,
-    vectors_type,
-)
+from warpshadow.device.constants import constant
+from warpshadow.device.lanes import lane_count, lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_slot
@@ -31,6 +26,7 @@ from warpshadow.stages.convex.convex_blockers import ConvexBlockers, PlacedParts
 from warpshadow.stages.convex.joint_lanes import coverage_type, make_joint_functions, sums_type
 from warpshadow.stages.convex.part_bounds import PartInputs, make_bound_functions, task_type
 from warpshadow.stages.convex.silhouette import ADJOINT_LANES, EDGE_LANES, SUM_LANES, make_silhouette_functions
+from warpshadow.stages.receivers.body_spans import Span, find_blocks, find_span
 from warpshadow.stages.visibility.culling import make_cells
 from warpshadow.stages.visibility.directional import SOFTNESS
 
@@ -52,7 +48,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     PartsTask, Coverages, SumsOfBlockers = task_type(lanes), coverage_type(lanes), sums_type(lanes)
     fn, silhouettes, joint = make_lane_functions(lanes), make_silhouette_functions(lanes), make_joint_functions(lanes)
     is_any_above, dot, scale, add, is_positive = fn.is_any_above, fn.dot, fn.scale, fn.add, fn.is_positive
-    find_block, load = fn.find_block, fn.load
+    load = fn.load
     find_bound, reaches_bundle, find_reach = make_bound_functions(lanes)
     find_silhouette, find_coverage = silhouettes.find_silhouette, silhouettes.find_coverage
     no_blockers, with_blocker = joint.no_blockers, joint.with_blocker
@@ -70,17 +66,17 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         numbers: wp.array3d(dtype=wp.int32),
     ):
         """Load a block of receivers; nothing is covered yet."""
-        batch, block = find_block(row, inputs.points.shape[1])
-        slot, instance = scratch_slot(worker, row), instance_in(batch, inputs.corners.shape[0])
+        block = find_span(inputs.spans, row)
+        slot, instance = scratch_slot(worker, row), instance_in(block.batch, inputs.corners.shape[0])
         task = PartsTask()
-        task.batch = batch
         task.block = block
+        task.skip = inputs.skips[block.span]
         task.slot = slot
         task.instance = instance
         task.bounds = inputs.bounds[instance]
-        task.points = load(inputs.points[batch], block)
+        task.points = load(inputs.points[block.batch][block.first : block.end], block.number)
         if inputs.horizon_normals:
-            task.normals = load(inputs.horizon_normals[batch], block)
+            task.normals = load(inputs.horizon_normals[block.batch][block.first : block.end], block.number)
         task.lift = Lane(1.0) - is_positive(dot(task.normals, task.normals))
         task.coverage = coverage[slot]
         task.covered = covered[slot]
@@ -141,7 +137,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     def cover_by_all_pieces(inputs: PartInputs, task: PartsTask):
         """Store sums over all pieces for each cell."""
         for piece in range(inputs.parts.first_part.shape[0] - 1):
-            if inputs.parts.bodies[piece] != inputs.skip and inputs.parts.blocks[piece] == 1:
+            if inputs.parts.bodies[piece] != task.skip and inputs.parts.blocks[piece] == 1:
                 covered_count = cover_by_piece(inputs, piece, task)
                 for k in range(covered_count):
                     q = task.covered[k]
@@ -181,7 +177,8 @@ def _make_cover(lanes: int) -> wp.Kernel:
         for q in range(task.coverage.shape[0]):
             if is_any_above(task.sums[q].total, 0.0):
                 task.coverage[q] = joint_coverage(task.sums[q])
-        store_columns(task.coverage, task.block, result[task.batch])
+        block = task.block
+        store_columns(task.coverage, block.number, result[block.batch][block.first : block.end])
 
     return cover_cells
 
@@ -235,7 +232,8 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
         task.silhouette.adj_edges = adj_edges[task.slot]
         parts, radius = inputs.parts, inputs.radius
         cover_by_all_pieces(inputs, task)
-        load_columns(adj_result[task.batch], task.block, task.coverage)
+        block = task.block
+        load_columns(adj_result[block.batch][block.first : block.end], block.number, task.coverage)
         for q in range(task.coverage.shape[0]):
             adj_sums[task.slot, q] = SumsOfBlockers()
             if is_any_above(task.sums[q].total, 0.0):
@@ -245,7 +243,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
         adj_point = Vectors()
         for piece in range(parts.first_part.shape[0] - 1):
             covered_count = int(0)
-            if parts.bodies[piece] != inputs.skip and parts.blocks[piece] == 1:
+            if parts.bodies[piece] != task.skip and parts.blocks[piece] == 1:
                 covered_count = cover_by_piece(inputs, piece, task)
             affected_count = int(0)
             for k in range(covered_count):
@@ -286,7 +284,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
                 for k in range(affected_count):
                     task.coverage[task.covered[k]] = Coverages()
         if adj_points:
-            add_vectors(adj_point, task.block, adj_points[task.batch])
+            add_vectors(adj_point, block.number, adj_points[block.batch][block.first : block.end])
 
     return cover_cells_adjoint
 
@@ -299,7 +297,8 @@ def part_coverage(
     *,
     radius: float | None = None,
     horizon_normals: wp.array | None = None,
-    skip: int | None = None,
+    body_spans: Sequence[Span] = (),
+    skips: Sequence[int] = (-1,),
     on_surface: bool = False,
 ) -> wp.array:
     """Coverage (h, μ) of cells by the convex parts of bodies.
@@ -310,7 +309,8 @@ def part_coverage(
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         radius: Of cells that do not tile the sphere [rad]; by default that of so many even ones, which do.
         horizon_normals: Normals, vec3 of shape [batch, receiver]: nothing blocks cells below the horizon.
-        skip: Number of the body that the receivers are part of, which blocks none of their light; None for none.
+        body_spans: Of the receivers, by body; () for one of all.
+        skips: Number of each span's body among the blockers, which blocks none of its light; −1 for none.
         on_surface: Whether receivers lie on the parts, which are those of one body, and have ``horizon_normals``: a
             part blocks no light of receivers that lie on a face of it and look out, nor below their tangent planes.
 
@@ -321,8 +321,8 @@ def part_coverage(
     """
     check.shape("points", points.shape, ("batch", "receiver"))
     check.shape("directions", directions.shape, ("direction", 3))
-    if skip is not None:
-        check.choice("skip", skip, range(blockers.body_count))
+    for skip in skips:
+        check.choice("skips", skip, range(-1, blockers.body_count))
     points = expand(points, common_batch({"points": points, "corners": placed_parts.corners}))
     inputs = PartInputs()
     inputs.points, inputs.parts, inputs.cells = points, blockers.arrays, make_cells(directions, SOFTNESS, points.device)
@@ -330,7 +330,8 @@ def part_coverage(
         inputs.horizon_normals = horizon_normals
     inputs.corners, inputs.face_planes, inputs.bounds = placed_parts
     inputs.radius = cell_radius(len(directions)) if radius is None else radius
-    inputs.skip = -1 if skip is None else skip
+    inputs.spans, block_count = find_blocks(body_spans, points.shape[1], lane_count(points.device), points.device)
+    inputs.skips = constant(np.array(skips), wp.int32, points.device)
     inputs.on_surface = on_surface
     lanes = lane_count(points.device)
     Lane, sums, edge_count = lane_type(lanes), sums_type(lanes), blockers.edge_count
@@ -339,7 +340,7 @@ def part_coverage(
     return launch_with_adjoint(
         _make_cover(lanes),
         lambda: _make_cover_adjoint(lanes),
-        points.shape[0] * block_count(points.shape[1], lanes),
+        points.shape[0] * block_count,
         inputs=[inputs],
         result=empty((*points.shape, len(directions)), dtype=wp.vec4, device=points.device),
         variables=[points],
