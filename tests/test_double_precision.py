@@ -457,14 +457,15 @@ def test_how_much_patch_samples_count(double, device, check):
 
 
 def test_gradients_of_radiosity_and_self_light_are_exact(double, device, check):
-    sparse, self_light = double("stages.sparse").SparseMatrix, double("stages.bounces.self_light").self_light
+    sparse, self_light = double("stages.sparse"), double("stages.bounces.self_light").self_light
     radiosity = double("stages.bounces.radiosity")
     mean = radiosity.mean_over_patch_samples(np.array([0, 0, 2]), np.array([0.3, 0.7, 1]), 3, device=device)
-    factors = sparse.from_matrix(np.abs(random(0, 5, 3)), device=device)
+    factors = sparse.SparseMatrix.from_matrix(np.abs(random(0, 5, 3)), device=device)
     rows = put(np.array([[[0, 1, 2], [4, 4, 3]]]), wp.vec3i, device)
 
     def light(albedo, shading, weights, addend):
-        return self_light(factors, radiosity.patch_radiosity(albedo, shading, mean), rows, weights, addend)
+        outgoing = radiosity.patch_radiosity(albedo, shading, mean)
+        return self_light(sparse.multiply(factors, outgoing), rows, weights, addend)
 
     sent = (wp.vec3d, random(1, 1, 3, 3)), (wp.vec3d, random(2, 2, 3, 3))
     check(light, *sent, (wp.vec3d, random(3, 1, 2, 3)), (wp.vec3d, random(4, 1, 2, 3)))

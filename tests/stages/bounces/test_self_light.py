@@ -14,7 +14,7 @@ from warpshadow.stages.bounces.self_light import self_light
 from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.patches import find_patches
 from warpshadow.stages.rays.ray_tracing import trace_visibility
-from warpshadow.stages.sparse import SparseMatrix
+from warpshadow.stages.sparse import SparseMatrix, multiply
 
 FLOAT32 = 1e-5
 LATTICE = 0.01
@@ -121,8 +121,7 @@ def test_light_is_mixed_from_the_sites_around_a_receiver(lit, placed, device, po
     given = [wp.array(values, dtype=wp.vec3, device=device, requires_grad=True) for values in (radiosity, weights)]
     with recorded() as tape:
         light = self_light(
-            SparseMatrix.from_matrix(factors, device=device),
-            given[0],
+            multiply(SparseMatrix.from_matrix(factors, device=device), given[0]),
             wp.array(rows, dtype=wp.vec3i, device=device),
             given[1],
         )

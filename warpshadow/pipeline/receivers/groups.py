@@ -370,14 +370,18 @@ def _groups_that_move(
     self_spheres = {body: merged_scene.spheres_among(sphere_bodies, body) for body in kinds.self_traced}
 
     def kind_of(span: Span) -> tuple[Hashable, ...]:
-        """All in which receivers of a group are the same."""
+        """All in which receivers of a group are the same; in the end their body, if it is alone in its group."""
         body = span.body
-        is_alone = by_body or body in kinds.planes or blockers.self_blocking_parts(body) is not None
-        has_parts = blockers.convex_parts_around(body) is not None
-        others = None if self_spheres.get(body) == (0, spheres[1].shape[1]) else spheres
-        lookup, is_glossy = IdentityKey(self_lookups.get(body)), body >= 0 and merged_scene.is_glossy[body]
-        kind = lookup, has_parts, body in kinds.solids, is_glossy, body if is_alone else body >= 0
-        return span.first < vertex_count, others is spheres, *kind
+        is_alone = by_body or merged_scene.is_flat[body] or blockers.self_blocking_parts(body) is not None
+        if merged_scene.scene.bounces and body not in self_lookups and body not in kinds.solids:
+            is_alone = True
+        has_spheres = self_spheres.get(body) != (0, spheres[1].shape[1])
+        is_glossy, has_parts = (
+            body >= 0 and merged_scene.is_glossy[body],
+            blockers.convex_parts_around(body) is not None,
+        )
+        kind = IdentityKey(self_lookups.get(body)), is_glossy, has_parts, body if is_alone else body >= 0
+        return span.first < vertex_count, has_spheres, *kind
 
     for (is_at_vertices, has_spheres, *_), consecutive in itertools.groupby(receivers.spans, kind_of):
         spans = tuple(consecutive)

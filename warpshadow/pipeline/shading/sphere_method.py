@@ -305,8 +305,7 @@ class VisibilityNode(Node):
         result_of: Callable[[LitPortion], Any] = operator.attrgetter("result"),
         join: Callable[[list[Any]], Any] | None = None,
     ):
-        self.method = method
-        self._portions_of = _find_portions_of(points, by_body=bool(method.merged_scene.scene.bounces))
+        self.method, self._portions_of = method, _find_portions_of(points)
         self._result_of, self._join = result_of, self.join if join is None else join
         self._progress, weak_points = method.progress and light is not None, points.weak_reference
         suffix, planes = points.suffix if suffix is None else suffix, points.blocker_kinds.planes
@@ -411,7 +410,7 @@ class ShadingNode(TransferNode):
         return portion._replace(result=result)
 
 
-def _find_portions_of(points: ShadingContext, *, by_body: bool) -> Callable[..., Iterator[Group]]:
+def _find_portions_of(points: ShadingContext, *, by_body: bool = False) -> Callable[..., Iterator[Group]]:
     """Make :func:`find_portions` for the receivers of points, without a reference to these."""
     return functools.partial(
         find_portions, by_body=by_body, static_bodies=points.static_bodies, nearest_spheres=points.nearest_spheres
