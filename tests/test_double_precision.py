@@ -637,18 +637,17 @@ def test_gradients_of_self_visibility_under_a_rotation_are_exact(sharp, double, 
     lookup, gather = double("stages.self_visibility.lookup"), double("stages.self_visibility.gather")
     directions = double("maths.directions").fibonacci(16)
     spreads = np.full(16, 0.1) if sharp else None
-    kernels = lookup.find_resampling_kernels(directions, spreads, 4096, wp.get_device(device))
+    kernels = lookup.find_body_kernels((0,), (4096,), directions, spreads, wp.get_device(device))
     bits = wp.array(rng.integers(0, 2**32, (6, 128), dtype=np.uint32), device=device)
     cells = wp.array(rng.integers(0, 256, (6, 512), dtype=np.uint8), device=device)
-    rows = double("stages.self_visibility.trace").VisibilityRows(bits, cells)
+    tables = gather.BodyTables.of_rows([double("stages.self_visibility.trace").VisibilityRows(bits, cells)])
     normals = wp.array(rng.normal(size=(1, 5, 3)), dtype=wp.vec3d, device=device)
     corners = wp.array(rng.integers(0, 6, (1, 5, 3)), dtype=wp.vec3i, device=device)
 
     def see(rotations, weights):
         places = double("stages.self_visibility.probes").ProbeWeights(corners, weights)
-        return gather.gather_self_transmittance(
-            normals, places, lookup.find_resampling_weights(rotations, 0, kernels), kernels, rows
-        )
+        weights_of_cells = lookup.find_resampling_weights(rotations, kernels)
+        return gather.gather_self_transmittance(normals, places, weights_of_cells, kernels, tables)
 
     matrices = torch.linalg.qr(torch.tensor(rng.normal(size=(2, 1, 3, 3))))[0]
     given = [values.to(device).requires_grad_() for values in (matrices, torch.tensor(rng.uniform(size=(1, 5, 3))))]

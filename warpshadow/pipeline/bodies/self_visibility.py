@@ -19,7 +19,6 @@ from warpshadow import check
 from warpshadow.assets.cache import Unfinished, cache_path, load_or_compute
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.batch import cut
-from warpshadow.device.constants import constant
 from warpshadow.device.memory import from_numpy
 from warpshadow.device.progress import announce
 from warpshadow.device.tape import unrecorded
@@ -41,7 +40,6 @@ from warpshadow.stages.self_visibility.lookup import (
     find_resampling_weights,
 )
 from warpshadow.stages.self_visibility.probes import (
-    ProbeTable,
     ProbeTables,
     ProbeWeights,
     VisibilityProbes,
@@ -218,19 +216,16 @@ class SelfVisibility:
 
     def _tables_of(self, bodies: tuple[int, ...]) -> ProbeTables:
         if bodies not in self._tables:
-            merged_scene, tables = self._merged_scene, tuple(map(self._table, bodies))
-            on_device = wp.array(list(tables), dtype=ProbeTable, device=merged_scene.device)
-            counts = int(merged_scene.first_vertex[-1]), int(merged_scene.first_face[-1])
-            self._tables[bodies] = ProbeTables(tables, on_device, *counts)
+            first_vertex, first_face = self._merged_scene.first_vertex.tolist(), self._merged_scene.first_face.tolist()
+            self._tables[bodies] = ProbeTables.of_bodies(
+                [self.probes(body) for body in bodies],
+                [first_vertex[body] for body in bodies],
+                [first_face[body] for body in bodies],
+                first_vertex[-1],
+                first_face[-1],
+                self._merged_scene.device,
+            )
         return self._tables[bodies]
-
-    def _table(self, body: int) -> ProbeTable:
-        merged_scene, probes = self._merged_scene, self.probes(body)
-        table = ProbeTable()
-        table.first_vertex, table.first_face = int(merged_scene.first_vertex[body]), int(merged_scene.first_face[body])
-        table.probe_count = len(probes.positions)
-        table.pieces = constant(probes.pieces, wp.vec4i, merged_scene.device)
-        return table
 
     # ----------------------------------------------------------------------------- tables and lookups
 

@@ -375,7 +375,7 @@ def _groups_that_move(
         is_alone = by_body or merged_scene.is_flat[body] or blockers.self_blocking_parts(body) is not None
         if merged_scene.scene.bounces and body not in self_lookups and body not in kinds.solids:
             is_alone = True
-        has_spheres = self_spheres.get(body) != (0, spheres[1].shape[1])
+        has_spheres = self_spheres.get(body, (0, 0)) != (0, spheres[1].shape[1])
         is_glossy, has_parts = (
             body >= 0 and merged_scene.is_glossy[body],
             blockers.convex_parts_around(body) is not None,

@@ -272,6 +272,25 @@ class ProbeTables(NamedTuple):
     vertex_count: int  # of all bodies
     face_count: int
 
+    @classmethod
+    def of_bodies(
+        cls,
+        probes: Sequence[VisibilityProbes],
+        first_vertices: Sequence[int],
+        first_faces: Sequence[int],
+        vertex_count: int,
+        face_count: int,
+        device: wp.DeviceLike,
+    ) -> "ProbeTables":
+        """Tables of some bodies, given the probes of each, and where its vertices and faces begin among all."""
+        tables = []
+        for of_body, first_vertex, first_face in zip(probes, first_vertices, first_faces, strict=True):
+            table = ProbeTable()
+            table.first_vertex, table.first_face, table.probe_count = first_vertex, first_face, len(of_body.positions)
+            table.pieces = wp.array(of_body.pieces, dtype=wp.vec4i, device=device)
+            tables.append(table)
+        return cls(tuple(tables), wp.array(tables, dtype=ProbeTable, device=device), vertex_count, face_count)
+
     def of_vertices(
         self, vertices: wp.array, spans: Sequence[Span] = (), table_of_span: Sequence[int] = (0,)
     ) -> ProbeWeights:
