@@ -64,7 +64,7 @@ class SelfFormFactors:
         return self._of_body[body]
 
     def of_senders(self, senders: Senders) -> ProbeFormFactors:
-        """Form factors of all senders but flat ones and those that are convex, which send themselves nothing."""
+        """Form factors of senders for themselves; flat and convex ones, which send themselves nothing, are left out."""
         if senders not in self._of_senders:
             from scipy.sparse import csr_matrix, vstack
 

@@ -2,16 +2,22 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
-from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.raster.interpolation import interpolate_at
-from warpshadow.stages.receivers.body_spans import ReceiverSpans, Span, find_blocks, span_of_receiver
+from warpshadow.stages.receivers.body_spans import (
+    ReceiverSpans,
+    Span,
+    SpanValues,
+    receiver_spans,
+    span_of_receiver,
+    span_values,
+    value_of_span,
+)
 
 
 @wp.kernel
@@ -19,7 +25,7 @@ def _interpolate_probes(
     # in
     probe_light: wp.array2d(dtype=wp.vec3),
     spans: ReceiverSpans,
-    first_probes: wp.array(dtype=wp.int32),
+    first_probes: SpanValues,
     probe_indices: wp.array2d(dtype=wp.vec3i),
     weights: wp.array2d(dtype=wp.vec3),
     addend: wp.array2d(dtype=wp.vec3),
@@ -31,7 +37,7 @@ def _interpolate_probes(
     light_batch = instance_in(batch, probe_light.shape[0])
     probe_batch = instance_in(batch, probe_indices.shape[0])
     receiver_light = wp.vec3()
-    first_probe = first_probes[span_of_receiver(spans, receiver)]
+    first_probe = value_of_span(first_probes, span_of_receiver(spans, receiver))
     if first_probe >= 0:
         probes = probe_indices[probe_batch, receiver] + wp.vec3i(first_probe, first_probe, first_probe)
         receiver_light += interpolate_at(probe_light[light_batch], probes, weights[probe_batch, receiver])
@@ -69,7 +75,7 @@ def self_light(
     batch_count = common_batch({"probe_light": probe_light, "probe_indices": probe_indices, "addend": addend})
     receiver_count, device = probe_indices.shape[1], probe_light.device
     light = empty((batch_count, receiver_count), dtype=wp.vec3, device=device)
-    spans = find_blocks(body_spans, receiver_count, 1, device).spans
-    inputs = [probe_light, spans, constant(np.array(first_probes), wp.int32, device), probe_indices, weights, addend]
+    spans = receiver_spans(body_spans, receiver_count, 1, device)
+    inputs = [probe_light, spans, span_values(first_probes, device), probe_indices, weights, addend]
     launch(_interpolate_probes, light.shape, inputs=inputs, outputs=[light])
     return light

@@ -16,7 +16,6 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, instance_in
-from warpshadow.device.constants import constant
 from warpshadow.device.lanes import lane_count, lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
@@ -26,7 +25,7 @@ from warpshadow.stages.convex.convex_blockers import ConvexBlockers, PlacedParts
 from warpshadow.stages.convex.joint_lanes import coverage_type, make_joint_functions, sums_type
 from warpshadow.stages.convex.part_bounds import PartInputs, make_bound_functions, task_type
 from warpshadow.stages.convex.silhouette import ADJOINT_LANES, EDGE_LANES, SUM_LANES, make_silhouette_functions
-from warpshadow.stages.receivers.body_spans import Span, find_blocks, find_span
+from warpshadow.stages.receivers.body_spans import Span, find_span, receiver_spans, span_values, value_of_span
 from warpshadow.stages.visibility.culling import make_cells
 from warpshadow.stages.visibility.directional import SOFTNESS
 
@@ -70,7 +69,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         slot, instance = scratch_slot(worker, row), instance_in(block.batch, inputs.corners.shape[0])
         task = PartsTask()
         task.block = block
-        task.skip = inputs.skips[block.span]
+        task.skip = value_of_span(inputs.skips, block.span)
         task.slot = slot
         task.instance = instance
         task.bounds = inputs.bounds[instance]
@@ -330,8 +329,8 @@ def part_coverage(
         inputs.horizon_normals = horizon_normals
     inputs.corners, inputs.face_planes, inputs.bounds = placed_parts
     inputs.radius = cell_radius(len(directions)) if radius is None else radius
-    inputs.spans, block_count = find_blocks(body_spans, points.shape[1], lane_count(points.device), points.device)
-    inputs.skips = constant(np.array(skips), wp.int32, points.device)
+    inputs.spans = receiver_spans(body_spans, points.shape[1], lane_count(points.device), points.device)
+    inputs.skips = span_values(skips, points.device)
     inputs.on_surface = on_surface
     lanes = lane_count(points.device)
     Lane, sums, edge_count = lane_type(lanes), sums_type(lanes), blockers.edge_count
@@ -340,7 +339,7 @@ def part_coverage(
     return launch_with_adjoint(
         _make_cover(lanes),
         lambda: _make_cover_adjoint(lanes),
-        points.shape[0] * block_count,
+        points.shape[0] * inputs.spans.block_count,
         inputs=[inputs],
         result=empty((*points.shape, len(directions)), dtype=wp.vec4, device=points.device),
         variables=[points],

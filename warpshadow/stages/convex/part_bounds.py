@@ -9,7 +9,7 @@ from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.stages.convex.convex_blockers import UNSEEN, ConvexArrays
 from warpshadow.stages.convex.joint_lanes import coverage_type, sums_type
 from warpshadow.stages.convex.silhouette import silhouette_type
-from warpshadow.stages.receivers.body_spans import ReceiverBlock, ReceiverSpans
+from warpshadow.stages.receivers.body_spans import ReceiverBlock, ReceiverSpans, SpanValues
 from warpshadow.stages.visibility.culling import DirectionCells
 
 _BOUND_MARGIN = 1.001  # bounds are so much larger, for rounding
@@ -35,7 +35,7 @@ class PartInputs:
     cells: DirectionCells
     radius: float  # of cells
     spans: ReceiverSpans
-    skips: wp.array(dtype=wp.int32)  # [span], the body that the receivers are part of, −1 for none
+    skips: SpanValues  # the body that the receivers are part of, −1 for none
     on_surface: bool  # whether receivers lie on the parts, which then are those of one body
 
 

@@ -41,7 +41,15 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneGrid
-from warpshadow.stages.receivers.body_spans import ReceiverSpans, Span, find_blocks, span_of_receiver
+from warpshadow.stages.receivers.body_spans import (
+    ReceiverSpans,
+    Span,
+    SpanValues,
+    receiver_spans,
+    span_of_receiver,
+    span_values,
+    value_of_span,
+)
 
 _FRONT_RADIUS_RATIO = wp.constant(1.25)
 """A patch sample is wholly in front of a plane where its height and its sphere's add up to 1/1.25 of the sphere's
@@ -175,7 +183,7 @@ def _find_fronts(
     normals: wp.array2d(dtype=wp.vec3),
     body_sides: wp.array3d(dtype=wp.float32),
     spans: ReceiverSpans,
-    body_of_span: wp.array(dtype=wp.int32),
+    body_of_span: SpanValues,
     centers: wp.array2d(dtype=wp.vec3),
     radii: wp.array2d(dtype=wp.float32),
     blocker_indices: wp.array(dtype=wp.int32),
@@ -212,7 +220,7 @@ def _find_fronts(
             else:
                 side_of_body = float(1.0)
                 if body_sides:
-                    body = body_of_span[span_of_receiver(spans, receiver)]
+                    body = value_of_span(body_of_span, span_of_receiver(spans, receiver))
                     side_of_body = body_sides[instance_in(batch, body_sides.shape[0]), body, plane]
                 front = _front_by_height(height, margin, side_of_body, wp.dot(normal, plane_normal))
             relative_height = height / (2.0 * _LIFT_IN_MARGINS * margin)
@@ -264,8 +272,8 @@ def find_fronts(
     shape = common_batch({**arguments, "body_sides": body_sides}), points.shape[1]
     front_weights = empty((*shape, planes.count), dtype=wp.float32, device=points.device)
     lifted_points = empty(shape, dtype=wp.vec3, device=points.device)
-    blocks = find_blocks(spans, points.shape[1], 1, points.device)
-    bodies = constant(np.array([span.body for span in spans] or [0]), wp.int32, points.device)
-    inputs = [points, normals, body_sides, blocks.spans, bodies, centers, radii, blocker_indices, frames, planes.grids]
+    of_spans = receiver_spans(spans, points.shape[1], 1, points.device)
+    bodies = span_values([span.body for span in spans] or [0], points.device)
+    inputs = [points, normals, body_sides, of_spans, bodies, centers, radii, blocker_indices, frames, planes.grids]
     launch(_find_fronts, shape, inputs=[*inputs, -1 if skip is None else skip], outputs=[front_weights, lifted_points])
     return PlaneFronts(front_weights, lifted_points)

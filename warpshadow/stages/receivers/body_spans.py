@@ -3,6 +3,7 @@
 A block of receivers lies in one span. Kernels leave out the body's own blockers, or read its table.
 """
 
+import functools
 import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,8 +11,10 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.device.constants import cached_by_values, constant
+from warpshadow.device.constants import constant
 from warpshadow.device.lanes import block_count
+from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 
 
@@ -37,10 +40,20 @@ def relative_spans(spans: Sequence[Span]) -> tuple[Span, ...]:
 
 @wp.struct
 class ReceiverSpans:
-    """Spans that follow each other; the last item of both arrays is the end of the last span."""
+    """Spans that follow each other; no arrays for one of all receivers. Their last item is the end of the last span."""
 
+    receiver_count: int
+    block_count: int  # of an instance
     first_receivers: wp.array(dtype=wp.int32)  # [span + 1]
     first_blocks: wp.array(dtype=wp.int32)  # [span + 1], of an instance
+
+
+@wp.struct
+class SpanValues:
+    """A number of each span."""
+
+    single: int  # where there is no array, that of all receivers
+    values: wp.array(dtype=wp.int32)  # [span]
 
 
 @wp.struct
@@ -57,31 +70,39 @@ class ReceiverBlock:
 @wp.func
 def find_span(spans: ReceiverSpans, row: int):
     """The block of a row, where the blocks of all instances follow each other."""
-    batch, number = split_row(row, spans.first_blocks[spans.first_blocks.shape[0] - 1])
-    span = wp.lower_bound(spans.first_blocks, number + 1) - 1
+    batch, number = split_row(row, spans.block_count)
     block = ReceiverBlock()
     block.batch = batch
-    block.span = span
-    block.first = spans.first_receivers[span]
-    block.end = spans.first_receivers[span + 1]
-    block.number = number - spans.first_blocks[span]
+    block.number = number
+    block.end = spans.receiver_count
+    if spans.first_blocks:
+        span = wp.lower_bound(spans.first_blocks, number + 1) - 1
+        block.span = span
+        block.first = spans.first_receivers[span]
+        block.end = spans.first_receivers[span + 1]
+        block.number = number - spans.first_blocks[span]
     return block
 
 
 @wp.func
 def span_of_receiver(spans: ReceiverSpans, receiver: int):
     """The span of a receiver of any instance."""
-    return wp.lower_bound(spans.first_receivers, receiver + 1) - 1
+    span = int(0)
+    if spans.first_receivers:
+        span = wp.lower_bound(spans.first_receivers, receiver + 1) - 1
+    return span
 
 
-class SpanBlocks(NamedTuple):
-    """Spans as kernels read them, and the number of blocks of an instance."""
+@wp.func
+def value_of_span(values: SpanValues, span: int):
+    """The number of a span."""
+    value = values.single
+    if values.values:
+        value = values.values[span]
+    return value
 
-    spans: ReceiverSpans
-    block_count: int
 
-
-def find_blocks(spans: Sequence[Span], receiver_count: int, lanes: int, device: wp.Device) -> SpanBlocks:
+def receiver_spans(spans: Sequence[Span], receiver_count: int, lanes: int, device: wp.Device) -> ReceiverSpans:
     """Cut spans into blocks.
 
     Args:
@@ -89,14 +110,54 @@ def find_blocks(spans: Sequence[Span], receiver_count: int, lanes: int, device: 
         receiver_count: Number of receivers.
         lanes: Receivers of a block.
     """
-    return _find_blocks(tuple(span.end for span in spans) or (receiver_count,), lanes, device)
+    ends = [span.end for span in spans] or [receiver_count]
+    first_receivers = [0, *ends]
+    counts = [block_count(end - first, lanes) for first, end in itertools.pairwise(first_receivers)]
+    result = ReceiverSpans()
+    result.receiver_count, result.block_count = receiver_count, sum(counts)
+    result.first_receivers = result.first_blocks = _no_numbers(device.alias)
+    if len(spans) > 1:
+        result.first_receivers = _put(first_receivers, device)
+        result.first_blocks = _put(list(itertools.accumulate(counts, initial=0)), device)
+    return result
 
 
-@cached_by_values
-def _find_blocks(ends: tuple[int, ...], lanes: int, device: wp.Device) -> SpanBlocks:
-    first_receivers = np.array([0, *ends], np.int32)
-    first_blocks = np.cumsum([0, *(block_count(int(size), lanes) for size in np.diff(first_receivers))])
-    spans = ReceiverSpans()
-    spans.first_receivers = constant(first_receivers, wp.int32, device)
-    spans.first_blocks = constant(first_blocks, wp.int32, device)
-    return SpanBlocks(spans, int(first_blocks[-1]))
+def span_values(values: Sequence[int], device: wp.Device) -> SpanValues:
+    """Give numbers of spans to a device."""
+    result = SpanValues()
+    result.single, result.values = values[0], _put(values, device) if len(values) > 1 else _no_numbers(device.alias)
+    return result
+
+
+@functools.cache
+def _no_numbers(device: str) -> wp.array:
+    return wp.empty(0, dtype=wp.int32, device=device)
+
+
+_WRITTEN_AT_ONCE = 64  # numbers that a launch has as arguments
+_Numbers = wp.types.vector(length=_WRITTEN_AT_ONCE, dtype=wp.int32)
+
+
+@wp.kernel(enable_backward=False)
+def _write_numbers(
+    # in
+    numbers: _Numbers,
+    first: int,
+    # out
+    result: wp.array(dtype=wp.int32),
+):
+    """A thread owns a number."""
+    i = wp.tid()
+    result[first + i] = numbers[i]
+
+
+def _put(numbers: Sequence[int], device: wp.Device) -> wp.array:
+    """Give numbers to a device. A graph gets them as arguments of launches: it has other receivers than plain calls."""
+    if not device.is_capturing:
+        return constant(np.array(numbers, np.int32), wp.int32, device)
+    result = empty(len(numbers), dtype=wp.int32, device=device)
+    for first in range(0, len(numbers), _WRITTEN_AT_ONCE):
+        part = numbers[first : first + _WRITTEN_AT_ONCE]
+        padded = _Numbers(*part, *[0] * (_WRITTEN_AT_ONCE - len(part)))
+        launch(_write_numbers, len(part), inputs=[padded, first], outputs=[result])
+    return result

@@ -13,11 +13,9 @@ import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, expand, instance_in
-from warpshadow.device.constants import constant
 from warpshadow.device.lanes import (
     Chunk,
     as_chunks,
@@ -31,7 +29,16 @@ from warpshadow.device.launch import launch, launch_with_adjoint
 from warpshadow.device.memory import as_items, empty, require_gradient
 from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.device.warp_sums import sum_over_warp
-from warpshadow.stages.receivers.body_spans import ReceiverBlock, ReceiverSpans, Span, find_blocks, find_span
+from warpshadow.stages.receivers.body_spans import (
+    ReceiverBlock,
+    ReceiverSpans,
+    Span,
+    SpanValues,
+    find_span,
+    receiver_spans,
+    span_values,
+    value_of_span,
+)
 from warpshadow.stages.self_visibility.lookup import BodyKernels, ResamplingKernels, ResamplingWeights
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.self_visibility.trace import VisibilityRows
@@ -55,7 +62,7 @@ class GatherInputs:
 
     normals: wp.array2d(dtype=wp.vec3)
     spans: ReceiverSpans
-    table_of_span: wp.array(dtype=wp.int32)  # [span], the number of its body among those of the tables
+    table_of_span: SpanValues  # the number of its body among those of the tables
     rows: wp.array2d(dtype=wp.vec3i)
     probe_weights: wp.array2d(dtype=wp.vec3)
     directions: wp.array(dtype=wp.vec3)
@@ -151,7 +158,7 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
         """Load a block of receivers, and S of all coarse cells where there are several."""
         block = find_span(inputs.spans, row)
         probes = load_probes(inputs, block)
-        table = inputs.tables[inputs.table_of_span[block.span]]
+        table = inputs.tables[value_of_span(inputs.table_of_span, block.span)]
         if wp.static(lanes > 1):
             for cell in range(shares.shape[0]):
                 shares[cell] = Lane(0.0)
@@ -185,7 +192,8 @@ def _make_gather(lanes: int) -> wp.Kernel:
         shares = scratch[scratch_slot(worker, item), 0]
         columns = scratch[scratch_slot(worker, item), 1]
         block, normal, probes, table = load_block(inputs, item, shares)
-        weight_batch, body = instance_in(block.batch, inputs.counts.shape[0]), inputs.table_of_span[block.span]
+        weight_batch = instance_in(block.batch, inputs.counts.shape[0])
+        body = value_of_span(inputs.table_of_span, block.span)
         kernels = inputs.kernels[body]
         rows = transmittance_self[block.batch][block.first : block.end]
         for q in range(inputs.directions.shape[0]):
@@ -244,7 +252,8 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         shares = scratch[scratch_slot(worker, item), 0]
         adj_shares = scratch[scratch_slot(worker, item), 1]
         block, normal, probes, table = load_block(inputs, item, shares)
-        weight_batch, body = instance_in(block.batch, inputs.counts.shape[0]), inputs.table_of_span[block.span]
+        weight_batch = instance_in(block.batch, inputs.counts.shape[0])
+        body = value_of_span(inputs.table_of_span, block.span)
         kernels = inputs.kernels[body]
         first_receiver = block.first + block.number * lanes
         if wp.static(lanes > 1):
@@ -358,8 +367,8 @@ def gather_self_transmittance(
     lanes = lane_count(device)
     inputs = GatherInputs()
     inputs.normals, inputs.rows, inputs.probe_weights = normals, *probe_weights
-    inputs.spans, blocks = find_blocks(spans, shape[1], lanes, device)
-    inputs.table_of_span = constant(np.array(table_of_span), wp.int32, device)
+    inputs.spans = receiver_spans(spans, shape[1], lanes, device)
+    inputs.table_of_span = span_values(table_of_span, device)
     inputs.directions, inputs.kernels, inputs.tables = directions, kernels.table, tables.table
     inputs.counts, inputs.indices, inputs.weights = resampling_weights
     lookup_count = _MEAN_LOOKUPS * direction_count * lanes
@@ -367,7 +376,7 @@ def gather_self_transmittance(
     return launch_with_adjoint(
         _make_gather(lanes),
         lambda: _make_gather_adjoint(lanes),
-        batch_count * blocks,
+        batch_count * inputs.spans.block_count,
         inputs=[inputs],
         result=empty(shape, dtype=wp.float32, device=device),
         variables=[probe_weights.weights],

@@ -225,7 +225,7 @@ def find_resampling_weights(rotations: wp.array, body_kernels: BodyKernels) -> R
     """
     kernels, bodies, table = body_kernels
     shape, device = (len(rotations), len(kernels), kernels[0].directions.size), rotations.device
-    lookups = *shape, max(each.max_lookups for each in kernels)
+    lookups = *shape, max(of_body.max_lookups for of_body in kernels)
     counts = empty(shape, dtype=wp.int32, device=device)
     indices = empty(lookups, dtype=wp.int32, device=device)
     inputs = [rotations, bodies, table]

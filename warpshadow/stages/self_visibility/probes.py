@@ -12,13 +12,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.maths.inset import inset_vertices
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.sides import split_side
-from warpshadow.stages.receivers.body_spans import ReceiverSpans, Span, find_blocks, span_of_receiver
+from warpshadow.stages.receivers.body_spans import (
+    ReceiverSpans,
+    Span,
+    SpanValues,
+    receiver_spans,
+    span_of_receiver,
+    span_values,
+    value_of_span,
+)
 
 _EVEN_FACES = 10_000
 """Edges are judged by those of an even cut of the surface into so many faces (507 vertices alone lose 3.5%)."""
@@ -186,14 +193,14 @@ def _find_vertex_weights(
     vertex_count: int,
     spans: ReceiverSpans,
     tables: wp.array(dtype=ProbeTable),
-    table_of_span: wp.array(dtype=wp.int32),
+    table_of_span: SpanValues,
     # out
     rows: wp.array2d(dtype=wp.vec3i),
     weights: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver at a vertex."""
     receiver = wp.tid()
-    table = tables[table_of_span[span_of_receiver(spans, receiver)]]
+    table = tables[value_of_span(table_of_span, span_of_receiver(spans, receiver))]
     vertex, is_back = split_side(vertices[receiver], vertex_count)
     row = vertex - table.first_vertex + wp.where(is_back, table.probe_count, 0)
     rows[0, receiver] = wp.vec3i(row, row, row)
@@ -249,14 +256,14 @@ def _find_sample_weights(
     face_count: int,
     spans: ReceiverSpans,
     tables: wp.array(dtype=ProbeTable),
-    table_of_span: wp.array(dtype=wp.int32),
+    table_of_span: SpanValues,
     # out
     rows: wp.array2d(dtype=wp.vec3i),
     weights: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver at a fragment, −1 for none."""
     batch, receiver = wp.tid()
-    table = tables[table_of_span[span_of_receiver(spans, receiver)]]
+    table = tables[value_of_span(table_of_span, span_of_receiver(spans, receiver))]
     face, is_back = split_side(wp.max(sides[batch, receiver], table.first_face), face_count)
     corners, piece_weights = _find_piece(table.pieces, face - table.first_face, barycentrics[batch, receiver])
     back_offset = wp.where(is_back, table.probe_count, 0)
@@ -317,8 +324,7 @@ class ProbeTables(NamedTuple):
 
     def _inputs(self, receiver_count: int, spans: Sequence[Span], table_of_span: Sequence[int]) -> list[Any]:
         device = self.table.device
-        blocks = find_blocks(spans, receiver_count, 1, device)
-        return [blocks.spans, self.table, constant(np.array(table_of_span), wp.int32, device)]
+        return [receiver_spans(spans, receiver_count, 1, device), self.table, span_values(table_of_span, device)]
 
 
 def _empty_weights(batch_count: int, count: int, device: wp.Device) -> ProbeWeights:

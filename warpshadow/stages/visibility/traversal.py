@@ -9,14 +9,20 @@ import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
 import warp as wp
 
-from warpshadow.device.constants import constant
 from warpshadow.device.lanes import lane_count, lane_type, make_lane_functions, vectors_type
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
-from warpshadow.stages.receivers.body_spans import ReceiverSpans, Span, find_blocks, find_span
+from warpshadow.stages.receivers.body_spans import (
+    ReceiverSpans,
+    Span,
+    SpanValues,
+    find_span,
+    receiver_spans,
+    span_values,
+    value_of_span,
+)
 from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres, cone_type, make_cone
 from warpshadow.stages.visibility.merging import (
     CLUSTER_SIZE,
@@ -125,7 +131,8 @@ class TraversalInputs:
     normals: wp.array2d(dtype=wp.vec3)  # empty where there is no horizon
     footprints: wp.array2d(dtype=wp.vec3)  # empty where receivers are points
     spans: ReceiverSpans
-    skips: wp.array(dtype=wp.vec2i)  # [span] spheres that are left out: the first, and the one after the last
+    skip_begins: SpanValues  # spheres that a span leaves out
+    skip_ends: SpanValues
     spheres: SphereClusters
 
 
@@ -173,13 +180,15 @@ def prepare_traversal(
     nodes, *bounds = find_clusters(centers, radii, merging) if clusters is None else clusters
     inputs = TraversalInputs()
     inputs.points, inputs.normals = points, normals
-    inputs.spans, block_count = find_blocks(body_spans, points.shape[1], lanes, points.device)
-    inputs.skips = constant(np.array(skips, np.int32), wp.vec2i, points.device)
+    inputs.spans = receiver_spans(body_spans, points.shape[1], lanes, points.device)
+    inputs.skip_begins, inputs.skip_ends = (
+        span_values([skip[end] for skip in skips], points.device) for end in range(2)
+    )
     spheres = inputs.spheres  # filled in place: a struct that is assigned is copied field by field
     spheres.centers, spheres.radii, spheres.extents = nodes
     spheres.count, spheres.merging_angle = count, merging * cell_radius
     spheres.cluster_bounds, spheres.run_bounds = bounds
-    return SphereTraversal(inputs, nodes, lanes, points.shape[0] * block_count)
+    return SphereTraversal(inputs, nodes, lanes, points.shape[0] * inputs.spans.block_count)
 
 
 @functools.cache
@@ -210,7 +219,8 @@ def make_load_receivers(has_horizon: bool, lanes: int) -> wp.Function:
         if wp.static(has_horizon):
             normals = load(inputs.normals[block.batch][block.first : block.end], block.number)
         points = load(inputs.points[block.batch][block.first : block.end], block.number)
-        return block, ReceiverLanes(points, normals, Lane(), inputs.skips[block.span])
+        skip = wp.vec2i(value_of_span(inputs.skip_begins, block.span), value_of_span(inputs.skip_ends, block.span))
+        return block, ReceiverLanes(points, normals, Lane(), skip)
 
     return load_receivers
 
