@@ -252,9 +252,11 @@ class SelfVisibility:
         ray_counts = tuple(rows.ray_count for rows in tables.rows)
         kernels = find_body_kernels(curved, ray_counts, directions, half_angles, rotations.device)
         lookup = SelfVisibilityLookup(curved, tables, find_resampling_weights(rotations, kernels), kernels)
-        sends_rays = [body for body in curved if has_sun and self._sends_rays(body)]
-        of_rays = {body: lookup._replace(rays=(self._ray_probes(body), rotations)) for body in sends_rays}
-        return dict.fromkeys(curved, lookup) | of_rays
+        result = dict.fromkeys(curved, lookup)
+        for body in curved:
+            if has_sun and self._sends_rays(body):
+                result[body] = lookup._replace(rays=(self._ray_probes(body), rotations))
+        return result
 
     def _ray_probes(self, body: int) -> RayProbes:
         """Where rays for a sun start."""

@@ -158,6 +158,6 @@ def _put(numbers: Sequence[int], device: wp.Device) -> wp.array:
     result = empty(len(numbers), dtype=wp.int32, device=device)
     for first in range(0, len(numbers), _WRITTEN_AT_ONCE):
         part = numbers[first : first + _WRITTEN_AT_ONCE]
-        padded = _Numbers(*part, *[0] * (_WRITTEN_AT_ONCE - len(part)))
-        launch(_write_numbers, len(part), inputs=[padded, first], outputs=[result])
+        arguments = [_Numbers(*part, *[0] * (_WRITTEN_AT_ONCE - len(part))), first]
+        launch(_write_numbers, len(part), inputs=arguments, outputs=[result])
     return result
