@@ -25,7 +25,7 @@ from warpshadow.stages.convex.convex_blockers import ConvexBlockers, PlacedParts
 from warpshadow.stages.convex.joint_lanes import coverage_type, make_joint_functions, sums_type
 from warpshadow.stages.convex.part_bounds import PartInputs, make_bound_functions, task_type
 from warpshadow.stages.convex.silhouette import ADJOINT_LANES, EDGE_LANES, SUM_LANES, make_silhouette_functions
-from warpshadow.stages.receivers.body_spans import Span, find_span, receiver_spans, span_values, value_of_span
+from warpshadow.stages.receivers.body_spans import Span, make_find_span, receiver_spans, span_values, value_of_span
 from warpshadow.stages.visibility.culling import make_cells
 from warpshadow.stages.visibility.directional import SOFTNESS
 
@@ -47,7 +47,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     PartsTask, Coverages, SumsOfBlockers = task_type(lanes), coverage_type(lanes), sums_type(lanes)
     fn, silhouettes, joint = make_lane_functions(lanes), make_silhouette_functions(lanes), make_joint_functions(lanes)
     is_any_above, dot, scale, add, is_positive = fn.is_any_above, fn.dot, fn.scale, fn.add, fn.is_positive
-    load = fn.load
+    load, find_span = fn.load, make_find_span(lanes)
     find_bound, reaches_bundle, find_reach = make_bound_functions(lanes)
     find_silhouette, find_coverage = silhouettes.find_silhouette, silhouettes.find_coverage
     no_blockers, with_blocker = joint.no_blockers, joint.with_blocker

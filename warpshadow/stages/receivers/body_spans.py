@@ -67,21 +67,26 @@ class ReceiverBlock:
     number: int
 
 
-@wp.func
-def find_span(spans: ReceiverSpans, row: int):
-    """The block of a row, where the blocks of all instances follow each other."""
-    batch, number = split_row(row, spans.block_count)
-    block = ReceiverBlock()
-    block.batch = batch
-    block.number = number
-    block.end = spans.receiver_count
-    if spans.first_blocks:
-        span = wp.lower_bound(spans.first_blocks, number + 1) - 1
-        block.span = span
-        block.first = spans.first_receivers[span]
-        block.end = spans.first_receivers[span + 1]
-        block.number = number - spans.first_blocks[span]
-    return block
+@functools.cache
+def make_find_span(lanes: int) -> wp.Function:
+    """Make the kernel function that finds the block of a row, where the blocks of all instances follow each other."""
+
+    @wp.func(inline=lanes == 1)
+    def find_span(spans: ReceiverSpans, row: int):
+        batch, number = split_row(row, spans.block_count)
+        block = ReceiverBlock()
+        block.batch = batch
+        block.number = number
+        block.end = spans.receiver_count
+        if spans.first_blocks:
+            block.span = wp.lower_bound(spans.first_blocks, number + 1) - 1
+            if wp.static(lanes > 1):  # a single receiver is counted among all: that takes fewer registers
+                block.first = spans.first_receivers[block.span]
+                block.end = spans.first_receivers[block.span + 1]
+                block.number = number - spans.first_blocks[block.span]
+        return block
+
+    return find_span
 
 
 @wp.func

@@ -34,7 +34,7 @@ from warpshadow.stages.receivers.body_spans import (
     ReceiverSpans,
     Span,
     SpanValues,
-    find_span,
+    make_find_span,
     receiver_spans,
     span_values,
     value_of_span,
@@ -102,7 +102,7 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
     Lane, ProbeLanes = lane_type(lanes), _probes_type(lanes)
     Rows = wp.types.vector(length=lanes, dtype=wp.int32)
     fn = make_lane_functions(lanes)
-    load = fn.load
+    load, find_span = fn.load, make_find_span(lanes)
 
     @wp.func
     def load_probes(inputs: GatherInputs, block: ReceiverBlock):

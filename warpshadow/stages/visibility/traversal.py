@@ -18,7 +18,7 @@ from warpshadow.stages.receivers.body_spans import (
     ReceiverSpans,
     Span,
     SpanValues,
-    find_span,
+    make_find_span,
     receiver_spans,
     span_values,
     value_of_span,
@@ -210,7 +210,7 @@ def receiver_lanes_type(lanes: int) -> Any:
 def make_load_receivers(has_horizon: bool, lanes: int) -> wp.Function:
     """Make the kernel function that loads receivers without footprints: inputs, row → block, receivers."""
     Lane, Vectors, ReceiverLanes = lane_type(lanes), vectors_type(lanes), receiver_lanes_type(lanes)
-    load = make_lane_functions(lanes).load
+    load, find_span = make_lane_functions(lanes).load, make_find_span(lanes)
 
     @wp.func(inline=True)
     def load_receivers(inputs: TraversalInputs, row: int):
