@@ -485,14 +485,15 @@ def test_how_much_patch_samples_count(double, device, check):
 
 
 def test_gradients_of_radiosity_and_self_light_are_exact(double, device, check):
-    sparse, self_light = double("stages.sparse").SparseMatrix, double("stages.bounces.self_light").self_light
+    sparse, self_light = double("stages.sparse"), double("stages.bounces.self_light").self_light
     radiosity = double("stages.bounces.radiosity")
     mean = radiosity.mean_over_patch_samples(np.array([0, 0, 2]), np.array([0.3, 0.7, 1]), 3, device=device)
-    factors = sparse.from_matrix(np.abs(random(0, 5, 3)), device=device)
+    factors = sparse.SparseMatrix.from_matrix(np.abs(random(0, 5, 3)), device=device)
     rows = put(np.array([[[0, 1, 2], [4, 4, 3]]]), wp.vec3i, device)
 
     def light(albedo, shading, weights, addend):
-        return self_light(factors, radiosity.patch_radiosity(albedo, shading, mean), rows, weights, addend)
+        outgoing = radiosity.patch_radiosity(albedo, shading, mean)
+        return self_light(sparse.multiply(factors, outgoing), rows, weights, addend)
 
     sent = (wp.vec3d, random(1, 1, 3, 3)), (wp.vec3d, random(2, 2, 3, 3))
     check(light, *sent, (wp.vec3d, random(3, 1, 2, 3)), (wp.vec3d, random(4, 1, 2, 3)))
@@ -664,18 +665,17 @@ def test_gradients_of_self_visibility_under_a_rotation_are_exact(sharp, double, 
     lookup, gather = double("stages.self_visibility.lookup"), double("stages.self_visibility.gather")
     directions = double("maths.directions").fibonacci(16)
     spreads = np.full(16, 0.1) if sharp else None
-    kernels = lookup.find_resampling_kernels(directions, spreads, 4096, wp.get_device(device))
+    kernels = lookup.find_body_kernels((0,), (4096,), directions, spreads, wp.get_device(device))
     bits = wp.array(rng.integers(0, 2**32, (6, 128), dtype=np.uint32), device=device)
     cells = wp.array(rng.integers(0, 256, (6, 512), dtype=np.uint8), device=device)
-    rows = double("stages.self_visibility.trace").VisibilityRows(bits, cells)
+    tables = gather.BodyTables.of_rows([double("stages.self_visibility.trace").VisibilityRows(bits, cells)])
     normals = wp.array(rng.normal(size=(1, 5, 3)), dtype=wp.vec3d, device=device)
     corners = wp.array(rng.integers(0, 6, (1, 5, 3)), dtype=wp.vec3i, device=device)
 
     def see(rotations, weights):
         places = double("stages.self_visibility.probes").ProbeWeights(corners, weights)
-        return gather.gather_self_transmittance(
-            normals, places, lookup.find_resampling_weights(rotations, 0, kernels), kernels, rows
-        )
+        weights_of_cells = lookup.find_resampling_weights(rotations, kernels)
+        return gather.gather_self_transmittance(normals, places, weights_of_cells, kernels, tables)
 
     matrices = torch.linalg.qr(torch.tensor(rng.normal(size=(2, 1, 3, 3))))[0]
     given = [values.to(device).requires_grad_() for values in (matrices, torch.tensor(rng.uniform(size=(1, 5, 3))))]

@@ -618,7 +618,7 @@ def test_only_what_moves_is_projected_onto_what_stands_still(monkeypatch):
     transmittance = directional.transmittance
 
     def recorded(points, normals, centers, radii, directions, **options):
-        first, end = options["skip"]
+        ((first, end),) = options["skips"] or ((0, 0),)
         asked.append((points.shape[1], radii.shape[1] - (end - first), points.requires_grad, len(directions)))
         return transmittance(points, normals, centers, radii, directions, **options)
 

@@ -5,13 +5,13 @@ import warnings
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_matrix
 
 import warpshadow as ws
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
 from warpshadow.pipeline.bounces import self_form_factors
 from warpshadow.pipeline.bounces.patches import ScenePatches
-from warpshadow.stages.sparse import SparseMatrix
 
 
 def scene_of(mesh: ws.Mesh) -> ws.Scene:
@@ -57,7 +57,7 @@ def test_they_are_traced_once_for_a_shape_wherever_it_stands(traced):
     assert traced == [162, 162]
 
 
-def factors_of(scene: ws.Scene) -> SparseMatrix:
+def factors_of(scene: ws.Scene) -> csr_matrix:
     """Form factors of its first body."""
     merged_scene = MergedScene(scene)
     self_visibility = SelfVisibility(merged_scene, np.zeros(len(scene.bodies), bool))
@@ -77,7 +77,4 @@ def test_a_damaged_file_is_traced_again_with_one_warning(traced, tmp_path):
         warnings.simplefilter("error")
         read = factors_of(scene)
     assert traced == [162, 162]
-    for one, second, third in zip(factors.rows, again.rows, read.rows, strict=True):
-        np.testing.assert_array_equal(one.numpy(), second.numpy())
-        np.testing.assert_array_equal(one.numpy(), third.numpy())
-    assert factors.rows[2].numpy().any()
+    assert factors.nnz and not (factors != again).nnz and not (factors != read).nnz

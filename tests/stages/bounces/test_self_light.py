@@ -14,7 +14,8 @@ from warpshadow.stages.bounces.self_light import self_light
 from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.patches import find_patches
 from warpshadow.stages.rays.ray_tracing import trace_visibility
-from warpshadow.stages.sparse import SparseMatrix
+from warpshadow.stages.receivers.body_spans import Span
+from warpshadow.stages.sparse import SparseMatrix, multiply
 
 FLOAT32 = 1e-5
 LATTICE = 0.01
@@ -113,6 +114,18 @@ def uniform(*shape, seed=0):
     return np.random.default_rng(seed).uniform(size=shape).astype(np.float32)
 
 
+def test_receivers_of_several_bodies_are_as_those_of_each_alone(device):
+    light, weights, addend = (wp.array(uniform(1, n, 3, seed=n), dtype=wp.vec3, device=device) for n in (9, 5, 5))
+    rows = np.random.default_rng(4).integers(0, 3, size=(1, 5, 3))
+    spans, first_probes = [Span(2, 0, 2), Span(0, 2, 3), Span(5, 3, 5)], (6, -1, 3)
+    probes = wp.array(rows, dtype=wp.vec3i, device=device)
+    got = self_light(light, probes, weights, addend, body_spans=spans, first_probes=first_probes).numpy()[0]
+    for (_, first, end), first_probe in zip(spans, first_probes, strict=True):
+        own = light.numpy()[0, first_probe + rows[0, first:end]] if first_probe >= 0 else np.zeros((end - first, 3, 3))
+        mixed = addend.numpy()[0, first:end] + np.einsum("rk,rkc->rc", weights.numpy()[0, first:end], own)
+        np.testing.assert_allclose(got[first:end], mixed, rtol=FLOAT32)
+
+
 @pytest.mark.parametrize(("lit", "placed"), [(1, 1), (2, 1), (1, 2), (2, 2)])
 def test_light_is_mixed_from_the_sites_around_a_receiver(lit, placed, device, poisoned_outputs, verified_tape):
     factors = uniform(6, 4) * (uniform(6, 4, seed=1) > 0.5)
@@ -121,8 +134,7 @@ def test_light_is_mixed_from_the_sites_around_a_receiver(lit, placed, device, po
     given = [wp.array(values, dtype=wp.vec3, device=device, requires_grad=True) for values in (radiosity, weights)]
     with recorded() as tape:
         light = self_light(
-            SparseMatrix.from_matrix(factors, device=device),
-            given[0],
+            multiply(SparseMatrix.from_matrix(factors, device=device), given[0]),
             wp.array(rows, dtype=wp.vec3i, device=device),
             given[1],
         )

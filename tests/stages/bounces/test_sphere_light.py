@@ -358,7 +358,7 @@ def test_spheres_that_are_left_out_are_as_those_of_no_radius(skip, device, monke
     values[4] = np.concatenate([values[4], clusters], axis=1)
     weights = np.random.default_rng(12).normal(size=(1, 19, 3))
     options = {"merging": 1.0}
-    got, got_gradients = gradients(values, weights, 16, device, skip=skip, **options)
+    got, got_gradients = gradients(values, weights, 16, device, skips=[skip], **options)
     radii, cluster = values[3].copy(), slice(0, 4)
     radii[0, slice(*skip)] = 0
     if skip[0] < cluster.stop:  # its four spheres no longer merge

@@ -12,6 +12,7 @@ from warpshadow.maths.directions import cell_radius, fibonacci
 from warpshadow.maths.hull import find_hull
 from warpshadow.stages.convex.convex_blockers import ConvexBlockers, ConvexBody
 from warpshadow.stages.convex.coverage import part_coverage
+from warpshadow.stages.receivers.body_spans import Span
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -301,7 +302,7 @@ def test_narrow_cells_and_a_receivers_own_body_are_left_to_it(device):
     # beside corners, where silhouettes are
     toward = np.concatenate([VERTICES[0], VERTICES[1]])[:16] - POINTS[0] + 0.004
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    got = of_kernel(POINTS[[0]], device, toward, radius=0.02, skip=1)[0]
+    got = of_kernel(POINTS[[0]], device, toward, radius=0.02, skips=[1])[0]
     expected = twin(POINTS[0], toward, 0.02, BODIES[:1])
     assert ((expected[:, 0] > 0.1) & (expected[:, 0] < 0.9)).sum() > 4
     np.testing.assert_allclose(got, expected, rtol=0, atol=RAYS)
@@ -319,7 +320,14 @@ def test_bodies_that_cast_no_shadow_block_nothing(device):
     some = blockers(device, blocks=(True, False))
     points = wp.array(POINTS[None], dtype=wp.vec3, device=device)
     got = part_coverage(points, some.place(vertices), some, DIRECTIONS).numpy()[0]
-    np.testing.assert_array_equal(got, of_kernel(POINTS, device, skip=1))
+    np.testing.assert_array_equal(got, of_kernel(POINTS, device, skips=[1]))
+
+
+def test_receivers_of_several_bodies_are_as_those_of_each_alone(device):
+    spans, skips = [Span(0, 0, 1), Span(-1, 1, 4), Span(1, 4, 6)], (0, -1, 1)
+    got = of_kernel(POINTS, device, body_spans=spans, skips=skips)
+    for (_, first, end), skip in zip(spans, skips, strict=True):
+        np.testing.assert_array_equal(got[first:end], of_kernel(POINTS[first:end], device, skips=[skip]))
 
 
 def test_nothing_below_the_horizon_is_blocked(device):
@@ -342,7 +350,7 @@ def test_instances_have_parts_of_their_own(device):
 
 
 def test_errors_name_the_argument(device):
-    with pytest.raises(ValueError, match=r"skip: got 2"):
-        of_kernel(POINTS, device, skip=2)
+    with pytest.raises(ValueError, match=r"skips: got 2"):
+        of_kernel(POINTS, device, skips=[2])
     with pytest.raises(ValueError, match=r"positions: got"):
         blockers(device).place(wp.zeros((1, 3), dtype=wp.vec3, device=device))

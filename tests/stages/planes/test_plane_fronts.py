@@ -7,6 +7,7 @@ from plane_settings import Setting, margin_of, ramp
 
 from warpshadow.device.tape import recorded
 from warpshadow.stages.planes.fronts import NearestBlockers, find_body_sides, find_fronts
+from warpshadow.stages.receivers.body_spans import Span
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
 
@@ -67,7 +68,8 @@ def test_fronts_and_their_gradients_are_those_of_the_twin(device):
     with recorded() as tape:
         spheres = NearestBlockers(centers, radii, numbers)
         sides = find_body_sides(corners, np.array([0, 4, 13], np.int32), frames, setting.planes)
-        fronts, lifted = find_fronts(points, normals, sides, spheres, frames, setting.planes, body=1)
+        spans = (Span(1, 0, points.shape[1]),)
+        fronts, lifted = find_fronts(points, normals, sides, spheres, frames, setting.planes, spans=spans)
     heights = over_margin(values[0], values[-1], setting.grids)
     expected = twin_fronts(*values, setting.grids, heights)
     np.testing.assert_allclose(fronts.numpy()[0], expected[:, :3], atol=5e-3)  # of a margin near float32's rounding

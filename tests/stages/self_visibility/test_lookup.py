@@ -6,7 +6,7 @@ import warp as wp
 
 from warpshadow.device.tape import recorded
 from warpshadow.maths.directions import cell_radius, fibonacci
-from warpshadow.stages.self_visibility.lookup import find_resampling_kernels, find_resampling_weights
+from warpshadow.stages.self_visibility.lookup import find_body_kernels, find_resampling_weights
 from warpshadow.stages.self_visibility.trace import RAYS_PER_CELL
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
@@ -45,7 +45,7 @@ def twin(rotation: np.ndarray, directions: np.ndarray, uses_rays: np.ndarray, co
 
 def dense(lookup) -> np.ndarray:
     """Weights [batch, direction, ray or coarse cell]."""
-    counts, indices, weights = (array.numpy() for array in lookup)
+    counts, indices, weights = (array.numpy()[:, 0] for array in lookup)
     found = np.zeros((*counts.shape, RAYS))
     batch, direction, k = np.nonzero(np.arange(weights.shape[2]) < counts[..., None])
     found[batch, direction, indices[batch, direction, k]] = weights[batch, direction, k]
@@ -54,10 +54,11 @@ def dense(lookup) -> np.ndarray:
 
 def looked_up(matrices: np.ndarray, device, requires_grad=False):
     directions = fibonacci(CELLS)
-    kernels = find_resampling_kernels(directions, spreads(), RAYS, wp.get_device(device))
+    body_kernels = find_body_kernels((0,), (RAYS,), directions, spreads(), wp.get_device(device))
+    (kernels,) = body_kernels.kernels
     rotations = wp.array(matrices, dtype=wp.mat33, device=device, requires_grad=requires_grad)
     described = directions, kernels.uses_rays.numpy() == 1, kernels.cos_radii.numpy().astype(np.float64)
-    return rotations, find_resampling_weights(rotations, 0, kernels), kernels, described
+    return rotations, find_resampling_weights(rotations, body_kernels), kernels, described
 
 
 def test_weights_are_those_of_the_formula(device):
@@ -66,7 +67,7 @@ def test_weights_are_those_of_the_formula(device):
     assert described[1].any() and not described[1].all()
     expected = np.stack([twin(matrix, *described) for matrix in matrices[:, 0]])
     assert np.abs(dense(lookup) - expected).max() < FLOAT32
-    np.testing.assert_allclose(lookup.weights.numpy().sum(axis=2), 1, atol=1e-5)
+    np.testing.assert_allclose(lookup.weights.numpy().sum(axis=3), 1, atol=1e-5)
 
 
 def test_there_is_room_for_what_any_rotation_looks_up(device):
@@ -91,7 +92,7 @@ def test_gradients_to_rotations_are_central_differences(is_rotation, device, ver
     with recorded() as tape:
         rotations, lookup, _, described = looked_up(matrices, device, requires_grad=True)
     values = rng.normal(size=(2, CELLS, RAYS))
-    batch, direction = np.indices(lookup.counts.shape)
+    batch, _, direction = np.indices(lookup.counts.shape)
     seeds = values[batch[..., None], direction[..., None], lookup.indices.numpy()]
     tape.backward(grads={lookup.weights: wp.array(seeds, dtype=wp.float32, device=device)})
     gradient = rotations.grad.numpy()[:, 0]

@@ -6,9 +6,10 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.receivers.body_spans import Span
 from warpshadow.stages.self_visibility.probes import (
     _ENTRY_RATIO,
-    ProbeTable,
+    ProbeTables,
     VisibilityProbes,
     find_probes,
     longest_edge,
@@ -28,9 +29,8 @@ FACES = np.array([(0, 1, 2), (3, 2, 1)])
 
 def table_of(
     probes: VisibilityProbes, device, *, first_vertex=0, vertex_count=4, first_face=0, face_count=2
-) -> ProbeTable:
-    pieces = wp.array(probes.pieces, dtype=wp.vec4i, device=device)
-    return ProbeTable(first_vertex, vertex_count, first_face, face_count, len(probes.positions), pieces)
+) -> ProbeTables:
+    return ProbeTables.of_bodies([probes], [first_vertex], [first_face], vertex_count, face_count, device)
 
 
 def seen_at(faces, barycentrics, device, requires_grad=False) -> Fragments:
@@ -107,6 +107,22 @@ def test_vertices_and_backs_of_a_body_among_others_have_its_own_numbers(device):
     np.testing.assert_array_equal(weights.numpy()[0, :, 0], 1)
     front, back = table.of_samples(seen_at([7, 57, -1], [(0.2, 0.3, 0.5)] * 3, device)).rows.numpy()[0, :2]
     np.testing.assert_array_equal(back, front + probe_count)
+
+
+def test_bodies_together_are_as_each_alone(device):
+    probes = [find_probes(POSITIONS, NORMALS, FACES, longest) for longest in (0.9, 0.3)]
+    starts = (0, 4), (0, 2), 8, 4, device
+    together = ProbeTables.of_bodies(probes, *starts)
+    alone = [ProbeTables.of_bodies([each], [4 * k], [2 * k], *starts[2:]) for k, each in enumerate(probes)]
+    spans, bodies = (Span(1, 0, 2), Span(0, 2, 3), Span(1, 3, 5)), (1, 0, 1)
+    vertices, faces = [4, 15, 2, 6, 7], [2, 7, 5, 3, 3]
+    at_vertices = together.of_vertices(wp.array(vertices, dtype=wp.int32, device=device), spans, bodies)
+    at_samples = together.of_samples(seen_at(faces, [(0.2, 0.3, 0.5)] * 5, device), spans, bodies)
+    for (_, first, end), body in zip(spans, bodies, strict=True):
+        of_vertices = alone[body].of_vertices(wp.array(vertices[first:end], dtype=wp.int32, device=device))
+        of_samples = alone[body].of_samples(seen_at(faces[first:end], [(0.2, 0.3, 0.5)] * (end - first), device))
+        for found, expected in zip((*at_vertices, *at_samples), (*of_vertices, *of_samples), strict=True):
+            np.testing.assert_array_equal(found.numpy()[:, first:end], expected.numpy())
 
 
 def test_gradients_to_barycentrics_are_central_differences(device, verified_tape):

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warpshadow.maths import directions as cells
+from warpshadow.stages.receivers.body_spans import Span
 from warpshadow.stages.visibility import directional, traversal
 
 # The step's slope in the dot product is 1/(hi − lo), up to 1/(1 − cos w) ≈ Q/0.245 for small caps: that much float32
@@ -289,10 +290,23 @@ def test_spheres_that_are_left_out_block_nothing(device):
     without = radii.copy()
     without[3:7] = 0
     expected = transmittance(points, normals, centers, without, cells.fibonacci(64), device)
-    got = transmittance(points, normals, centers, radii, cells.fibonacci(64), device, skip=(3, 7))
+    got = transmittance(points, normals, centers, radii, cells.fibonacci(64), device, skips=[(3, 7)])
     np.testing.assert_array_equal(got, expected)
-    with pytest.raises(ValueError, match="skip: got"):
-        transmittance(points, normals, centers, radii, cells.fibonacci(64), device, skip=(3, len(radii) + 1))
+    with pytest.raises(ValueError, match="skips: got"):
+        transmittance(points, normals, centers, radii, cells.fibonacci(64), device, skips=[(3, len(radii) + 1)])
+
+
+def test_receivers_of_several_bodies_are_as_those_of_each_alone(device):
+    """Spans do not end where blocks of lanes do, and one is empty."""
+    points, normals, centers, radii = (np.stack([values] * 2) for values in twins.random_scene(15, vertex_count=50))
+    points[1] += 0.1
+    directions, skips = cells.fibonacci(64), [(3, 7), (0, 0), (0, len(radii[0])), (1, 2)]
+    spans = [Span(0, 0, 19), Span(1, 19, 19), Span(2, 19, 30), Span(3, 30, 50)]
+    got = transmittance(points, normals, centers, radii, directions, device, body_spans=spans, skips=skips)
+    for (_, first, end), skip in zip(spans, skips, strict=True):
+        of_body = points[:, first:end], normals[:, first:end]
+        expected = transmittance(*of_body, centers, radii, directions, device, skips=[skip])
+        np.testing.assert_array_equal(got[:, first:end], expected)
 
 
 def test_concentric_and_hundreds_of_overlapping_spheres_are_finite(device):

@@ -6,6 +6,7 @@ panels are chords of bent cloth, in which its receivers do not lie.
 """
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.scene.blockers import blocking_parts, find_solids
 from warpshadow.stages.convex.convex_blockers import ConvexBlockers, ConvexBody, PlacedParts
 from warpshadow.stages.convex.coverage import part_coverage
+from warpshadow.stages.receivers.body_spans import Span
 
 
 class GroupConvexParts(NamedTuple):
@@ -23,13 +25,22 @@ class GroupConvexParts(NamedTuple):
 
     blockers: ConvexBlockers
     placed_parts: PlacedParts
-    skip: int | None = None  # index, among the bodies of blockers, of the body that the receivers are part of
+    bodies: tuple[int, ...] = ()  # that blockers number, each of which blocks none of its own receivers' light
     on_surface: bool = False  # whether receivers lie on the parts, which are those of one body
 
+    def number_of(self, body: int) -> int:
+        """The number that a body has here; −1 for none."""
+        return self.bodies.index(body) if body in self.bodies else -1
+
     def coverage(
-        self, points: wp.array, horizon_normals: wp.array | None, directions: np.ndarray, radius: float | None = None
+        self,
+        points: wp.array,
+        horizon_normals: wp.array | None,
+        directions: np.ndarray,
+        radius: float | None = None,
+        spans: Sequence[Span] = (),
     ) -> wp.array:
-        """Coverage of cells by them, see :func:`.part_coverage`. Differentiable: points."""
+        """Coverage of cells by them for receivers in spans, see :func:`.part_coverage`. Differentiable: points."""
         return part_coverage(
             points,
             self.placed_parts,
@@ -37,7 +48,8 @@ class GroupConvexParts(NamedTuple):
             directions,
             radius=radius,
             horizon_normals=horizon_normals,
-            skip=self.skip,
+            body_spans=spans,
+            skips=[self.number_of(span.body) for span in spans] or [-1],
             on_surface=self.on_surface,
         )
 

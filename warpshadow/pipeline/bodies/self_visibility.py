@@ -30,17 +30,18 @@ from warpshadow.spheres.normalized_mesh import normalize
 from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.rays.ray_packets import FaceTree, build_face_tree
-from warpshadow.stages.receivers.find import Receivers, Span
+from warpshadow.stages.receivers.body_spans import Span, relative_spans
+from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.self_visibility.buried import find_buried, find_dilation
-from warpshadow.stages.self_visibility.gather import gather_self_transmittance
+from warpshadow.stages.self_visibility.gather import BodyTables, gather_self_transmittance
 from warpshadow.stages.self_visibility.lookup import (
-    ResamplingKernels,
+    BodyKernels,
     ResamplingWeights,
-    find_resampling_kernels,
+    find_body_kernels,
     find_resampling_weights,
 )
 from warpshadow.stages.self_visibility.probes import (
-    ProbeTable,
+    ProbeTables,
     ProbeWeights,
     VisibilityProbes,
     find_probes,
@@ -74,23 +75,27 @@ _OF_MESHES: weakref.WeakKeyDictionary[Mesh, dict[tuple[str, bool, str], object]]
 
 
 class SelfVisibilityLookup(NamedTuple):
-    """Self-visibility lookups of a body's receivers."""
+    """Self-visibility lookups of receivers of some bodies."""
 
-    rows: VisibilityRows
-    trace_seen_backs: Callable[[ProbeWeights], None]  # fills rows of backs on which receivers lie
-    lookup: ResamplingWeights
-    kernels: ResamplingKernels
+    bodies: tuple[int, ...]
+    trace_seen_backs: Callable[[ProbeWeights, tuple[Span, ...]], None]  # fills rows of backs with receivers
+    tables: BodyTables
+    weights: ResamplingWeights
+    kernels: BodyKernels
     rays: tuple[RayProbes, wp.array] | None = None  # for a sun, and the rotations; None where it is looked up, too
 
     @property
     def turned(self) -> wp.array:
         """The part that depends on the rotations, of shape [batch, …]."""
-        return self.lookup.weights
+        return self.weights.weights
 
-    def transmittance(self, normals: wp.array, weights: ProbeWeights) -> wp.array:
-        """Transmittance of receivers past their body, [batch, receiver, cell]."""
-        self.trace_seen_backs(weights)
-        return gather_self_transmittance(normals, weights, self.lookup, self.kernels, self.rows)
+    def transmittance(self, normals: wp.array, weights: ProbeWeights, spans: tuple[Span, ...]) -> wp.array:
+        """Transmittance of receivers in spans past their bodies, [batch, receiver, cell]."""
+        self.trace_seen_backs(weights, spans)
+        table_of_span = [self.bodies.index(span.body) for span in spans]
+        return gather_self_transmittance(
+            normals, weights, self.weights, self.kernels, self.tables, spans, table_of_span
+        )
 
 
 class SelfVisibilityLobes(NamedTuple):
@@ -109,6 +114,10 @@ class SelfVisibilityLobes(NamedTuple):
         return self_visibility_lobes(self.lobes, weights, self.turn, order=order, bands=bands)
 
 
+SelfLookup = SelfVisibilityLookup | SelfVisibilityLobes
+"""Self-visibility of receivers, in cells or in bands."""
+
+
 class SelfVisibility:
     """Traced self-visibility of the bodies, each in its own frame.
 
@@ -121,9 +130,10 @@ class SelfVisibility:
     def __init__(self, merged_scene: MergedScene, samples_receive: np.ndarray, *, progress: bool = False):
         self._merged_scene, self._samples_receive, self._progress = merged_scene, samples_receive, progress
         self._probes: dict[int, VisibilityProbes] = {}
-        self._tables: dict[int, ProbeTable] = {}
+        self._tables: dict[tuple[int, ...], ProbeTables] = {}
         self._rows: dict[int, VisibilityRows] = {}
         self._lobes: dict[tuple[int, int], wp.array] = {}
+        self._body_tables: dict[tuple[int, ...], BodyTables] = {}
 
     # ----------------------------------------------------------------------------------- kind of self-shadow
 
@@ -185,33 +195,41 @@ class SelfVisibility:
             cached[key] = find()
         return cached[key]
 
-    def probe_weights(self, receivers: Receivers, span: Span) -> ProbeWeights:
-        """Where receivers of a body lie among its probes. Differentiable: barycentrics of samples."""
+    def probe_weights(self, receivers: Receivers, spans: tuple[Span, ...]) -> ProbeWeights:
+        """Where receivers lie among the probes of their bodies. Differentiable: barycentrics of samples.
+
+        Args:
+            receivers: All of them.
+            spans: Some that follow each other, all at vertices or all at samples.
+        """
         assert receivers.vertices is not None
-        table, first, end = self._table(span.body), span.first, span.end
-        vertex_count = receivers.vertices.size
+        bodies = tuple(dict.fromkeys(span.body for span in spans))
+        first, end, vertex_count = spans[0].first, spans[-1].end, receivers.vertices.size
+        places = relative_spans(spans), [bodies.index(span.body) for span in spans]
         if first < vertex_count:
-            return table.of_vertices(receivers.vertices[first:end])
+            return self._tables_of(bodies).of_vertices(receivers.vertices[first:end], *places)
         fragments, first, end = receivers.sample_fragments, first - vertex_count, end - vertex_count
         assert fragments is not None
-        return table.of_samples(Fragments(cut(fragments.face_ids, first, end), cut(fragments.barycentrics, first, end)))
+        seen = Fragments(cut(fragments.face_ids, first, end), cut(fragments.barycentrics, first, end))
+        return self._tables_of(bodies).of_samples(seen, *places)
 
     def probe_weights_of(self, body: int, vertices: np.ndarray) -> ProbeWeights:
         """Where vertices of a body lie among its probes; backs are numbered after the last vertex."""
-        return self._table(body).of_vertices(from_numpy(vertices, dtype=wp.int32, device=self._merged_scene.device))
+        on_device = from_numpy(vertices, dtype=wp.int32, device=self._merged_scene.device)
+        return self._tables_of((body,)).of_vertices(on_device)
 
-    def _table(self, body: int) -> ProbeTable:
-        if body not in self._tables:
-            merged_scene, probes = self._merged_scene, self.probes(body)
-            self._tables[body] = ProbeTable(
-                int(merged_scene.first_vertex[body]),
-                int(merged_scene.first_vertex[-1]),
-                int(merged_scene.first_face[body]),
-                int(merged_scene.first_face[-1]),
-                len(probes.positions),
-                from_numpy(probes.pieces, dtype=wp.vec4i, device=merged_scene.device),
+    def _tables_of(self, bodies: tuple[int, ...]) -> ProbeTables:
+        if bodies not in self._tables:
+            first_vertex, first_face = self._merged_scene.first_vertex.tolist(), self._merged_scene.first_face.tolist()
+            self._tables[bodies] = ProbeTables.of_bodies(
+                [self.probes(body) for body in bodies],
+                [first_vertex[body] for body in bodies],
+                [first_face[body] for body in bodies],
+                first_vertex[-1],
+                first_face[-1],
+                self._merged_scene.device,
             )
-        return self._tables[body]
+        return self._tables[bodies]
 
     # ----------------------------------------------------------------------------- tables and lookups
 
@@ -231,15 +249,18 @@ class SelfVisibility:
             has_sun: Whether there are sun cells, to which receivers of some bodies send rays.
         """
         self._announce(bodies)
-        result = {}
-        for body in bodies:
-            if not self._merged_scene.is_flat[body]:
-                rows = self.rows(body)
-                kernels = find_resampling_kernels(directions, half_angles, rows.ray_count, rotations.device)
-                rays = (self._ray_probes(body), rotations) if has_sun and self._sends_rays(body) else None
-                resampling_weights = find_resampling_weights(rotations, body, kernels)
-                trace_seen_backs = functools.partial(self._trace_seen_backs, body)
-                result[body] = SelfVisibilityLookup(rows, trace_seen_backs, resampling_weights, kernels, rays)
+        curved = tuple(body for body in bodies if not self._merged_scene.is_flat[body])
+        if curved not in self._body_tables:
+            self._body_tables[curved] = BodyTables.of_rows(tuple(map(self.rows, curved)))
+        tables = self._body_tables[curved]
+        ray_counts = tuple(rows.ray_count for rows in tables.rows)
+        kernels = find_body_kernels(curved, ray_counts, directions, half_angles, rotations.device)
+        resampling_weights = find_resampling_weights(rotations, kernels)
+        lookup = SelfVisibilityLookup(curved, self._trace_seen_backs, tables, resampling_weights, kernels)
+        result = dict.fromkeys(curved, lookup)
+        for body in curved:
+            if has_sun and self._sends_rays(body):
+                result[body] = lookup._replace(rays=(self._ray_probes(body), rotations))
         return result
 
     def _ray_probes(self, body: int) -> RayProbes:
@@ -322,12 +343,13 @@ class SelfVisibility:
         if self._merged_scene.is_two_sided[body]:
             self._cached_by_mesh(body, "backs", fill)
 
-    def _trace_seen_backs(self, body: int, weights: ProbeWeights) -> None:
+    def _trace_seen_backs(self, weights: ProbeWeights, spans: tuple[Span, ...]) -> None:
         """Fill the rows of backs if receivers lie on some, or if that cannot be read without waiting."""
-        if self._merged_scene.is_two_sided[body] and weights.rows.size:
-            count = len(self.probes(body).positions)
-            if not is_readable(self._merged_scene.device) or weights.rows.numpy().max() >= count:
-                self._trace_backs(body)
+        for body, first, end in spans:
+            if self._merged_scene.is_two_sided[body]:
+                count = len(self.probes(body).positions)
+                if not is_readable(self._merged_scene.device) or weights.rows.numpy()[:, first:end].max() >= count:
+                    self._trace_backs(body)
 
     def _announce(self, bodies: tuple[int, ...], side: int = _FRONT) -> None:
         """Say how long rows that are to be traced take, if that is long."""

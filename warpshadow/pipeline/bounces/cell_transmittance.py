@@ -53,9 +53,10 @@ def find_cell_transmittance(
     else:
         directions, transmittance_self = HARMONIC_GATHER_CELLS, None
         transmittance_nonplanar = _transmittance(method, group, merged_scene.nonplanar_bodies, spheres, directions)
-    body = group.receiver_body
-    if transmittance_self is None and body is not None and not (body.is_solid or merged_scene.is_flat[body.number]):
-        transmittance_self = _transmittance(method, group, [body.number], spheres, directions)
+    bodies = group.receiver_bodies
+    if transmittance_self is None and bodies is not None and not bodies.is_solid:
+        nonplanar = [span.body for span in group.spans if not merged_scene.is_flat[span.body]]
+        transmittance_self = _transmittance(method, group, nonplanar, spheres, directions)
     if transmittance_nonplanar is None:
         transmittance_nonplanar = wp.full(
             (*group.points.shape, len(directions)), 1.0, wp.float32, device=group.points.device

@@ -15,7 +15,7 @@ from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
 from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.bounces.proxies import PlacedProxies, Proxies
-from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
+from warpshadow.pipeline.bounces.self_form_factors import ProbeFormFactors, SelfFormFactors
 from warpshadow.pipeline.node import Call, ExplainRow, Node
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.scene.visibility import Visibility
@@ -25,6 +25,7 @@ from warpshadow.stages.bounces.plane_texels import find_texels
 from warpshadow.stages.bounces.proxy_radiance import find_proxy_radiance
 from warpshadow.stages.bounces.self_light import self_light
 from warpshadow.stages.bounces.sphere_light import sphere_light
+from warpshadow.stages.sparse import multiply
 
 ALL_FLAT = "all that reflects is flat"  # why no body sends light to itself, in words
 
@@ -46,6 +47,7 @@ class OutgoingRadiance:
 
     Args:
         proxies: Proxies of the bodies whose patches they are.
+        self_form_factors: Form factors of these bodies for themselves.
         radiosity: Of the patches, vec3 of shape [batch, patch].
         placed_proxies: Their proxies, in the world.
         frames: Where flat bodies are, vec3 of shape [batch, 3 · plane].
@@ -55,6 +57,7 @@ class OutgoingRadiance:
     def __init__(
         self,
         proxies: Proxies,
+        self_form_factors: SelfFormFactors,
         radiosity: wp.array,
         placed_proxies: PlacedProxies,
         frames: wp.array,
@@ -62,11 +65,17 @@ class OutgoingRadiance:
     ):
         self.proxies, self.senders, self.radiosity = proxies, proxies.senders, radiosity
         self.placed_proxies, self.frames, self.patch_weights = placed_proxies, frames, patch_weights
+        self._self_form_factors = self_form_factors
 
-    def of_body(self, body: int) -> wp.array:
-        """Radiosity of the patches of a body, vec3 of shape [batch, patch]."""
-        sender_index = self.senders.bodies.index(body)
-        return cut(self.radiosity, *self.senders.first[sender_index : sender_index + 2].tolist())
+    @functools.cached_property
+    def probe_form_factors(self) -> ProbeFormFactors:
+        """Form factors by which bodies send light to their own probes."""
+        return self._self_form_factors.of_senders(self.senders)
+
+    @functools.cached_property
+    def probe_light(self) -> wp.array:
+        """Light that bodies send to their own probes, vec3 of shape [batch, probe]."""
+        return multiply(self.probe_form_factors.matrix, self.radiosity)
 
     @functools.cached_property
     def proxy_radiance(self) -> wp.array:
@@ -93,7 +102,6 @@ class BounceGatherer:
     Args:
         visibility: How spheres block light.
         senders: The bodies whose patches send light.
-        self_form_factors: Form factors of bodies for themselves.
         item_text: Number of receivers, in words.
         suffix: Ends the names of its rows.
         why_not: Why nobody asks for it, in words; empty if somebody does.
@@ -106,13 +114,12 @@ class BounceGatherer:
         self,
         visibility: Visibility,
         senders: Senders,
-        self_form_factors: SelfFormFactors,
         item_text: str | Callable[[], str],
         suffix: str = "",
         why_not: str = "",
         only_others: bool = False,
     ):
-        self._visibility, self._self_form_factors = visibility, self_form_factors
+        self._visibility = visibility
         self._is_flat, sphere_counts = senders.merged_scene.is_flat, senders.merged_scene.sphere_counts
         nonplanar_bodies = [body for body in senders.bodies if not self._is_flat[body]]
         idle = (
@@ -143,20 +150,19 @@ class BounceGatherer:
     def _from_itself(
         self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array
     ) -> wp.array:
-        body = outgoing.senders.receiver_body(group)
-        if body is None:
+        bodies, spans = group.receiver_bodies, group.spans
+        first_probes = outgoing.probe_form_factors.first_of(spans)
+        if bodies is None or max(first_probes) < 0:  # convex bodies send themselves nothing
             return others
-        form_factors = self._self_form_factors.of(body.number)
-        if form_factors.is_zero:  # a convex body sends itself nothing
-            return others
-        return self_light(form_factors, outgoing.of_body(body.number), *body.probe_weights, others)
+        probes = bodies.probe_weights
+        return self_light(outgoing.probe_light, *probes, others, body_spans=spans, first_probes=first_probes)
 
     def _from_planes(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array
     ) -> wp.array:
         planes = outgoing.proxies.planes
         assert planes is not None
-        skip = planes.index_of_body.get(group.body)
+        skip = planes.index_of_body.get(group.spans[0].body)
         if planes.blockers.count == (skip is not None):
             return others
         fronts = group.find_fronts(outgoing.frames, planes.blockers, skip)
@@ -170,7 +176,8 @@ class BounceGatherer:
     def _from_spheres(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array
     ) -> wp.array:
-        if not any(body != group.body and not self._is_flat[body] for body in outgoing.senders.bodies):
+        bodies = {span.body for span in group.spans}
+        if not any({body} != bodies and not self._is_flat[body] for body in outgoing.senders.bodies):
             return others
         proxies, proxy_radiance = outgoing.placed_proxies, outgoing.proxy_radiance
         softness = self._visibility.softness
@@ -188,7 +195,8 @@ class BounceGatherer:
             transmittance.directions,
             softness=softness,
             merging=self._visibility.merging,
-            skip=outgoing.proxies.span_of(group.body),
+            body_spans=group.spans,
+            skips=[outgoing.proxies.span_of(span.body) for span in group.spans],
             clusters=proxies.clusters if is_same else None,
             tangent_planes=proxies.tangent_planes,
             addend=others,

@@ -158,7 +158,8 @@ class Radiosity(Node):
             self_factors = None
 
         def outgoing_of(radiosity: wp.array) -> OutgoingRadiance:
-            return OutgoingRadiance(self._proxies, radiosity, placed_proxies, frames, weights.weights)
+            arguments = self._proxies, self._self_form_factors, radiosity
+            return OutgoingRadiance(*arguments, placed_proxies, frames, weights.weights)
 
         def radiosity_by_others(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""
@@ -300,4 +301,4 @@ class MovingBounces:
         return PatchSampleNodes(lit_samples, visibility, frames, placed_proxies, weights)
 
     def _gatherer(self, senders: Senders, *arguments: Any, **options: Any) -> BounceGatherer:
-        return BounceGatherer(self._method.visibility, senders, self._self_form_factors, *arguments, **options)
+        return BounceGatherer(self._method.visibility, senders, *arguments, **options)

@@ -18,7 +18,6 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.bodies.scene_planes import ScenePlanes
 from warpshadow.pipeline.bounces.contacts import find_contacts
 from warpshadow.pipeline.node import Node
-from warpshadow.pipeline.receivers.groups import Group, ReceiverBody
 from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
 from warpshadow.stages.bounces.radiosity import mean_over_patch_samples
@@ -240,13 +239,6 @@ class Senders:
         self.mean = mean_over_patch_samples(
             self.patch_of_sample, weights, int(self.first[-1]), device=merged_scene.device
         )
-
-    def receiver_body(self, group: Group) -> ReceiverBody | None:
-        """The body of a group's receivers, if it sends them light: flat bodies do not."""
-        body = group.receiver_body
-        if body is None or body.number not in self.bodies or self.merged_scene.is_flat[body.number]:
-            return None
-        return body
 
     def patch_samples(self, positions: wp.array, normals: wp.array) -> Receivers:
         """Patch samples as receivers, of all vertices, vec3 [batch, vertex]. Differentiable: positions, normals."""

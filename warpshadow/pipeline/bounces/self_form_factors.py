@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -16,6 +16,7 @@ from warpshadow.pipeline.bounces.patches import ScenePatches, Senders
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.stages.bounces.form_factors import patch_mesh, trace_form_factors
 from warpshadow.stages.patches import Patches
+from warpshadow.stages.receivers.body_spans import Span
 from warpshadow.stages.sparse import SparseMatrix
 
 if TYPE_CHECKING:
@@ -23,6 +24,17 @@ if TYPE_CHECKING:
 
 VERSION = 3  # part of the key of cached form factors: raise it whenever they would come out differently
 _RAYS = 512  # rays of a probe
+
+
+class ProbeFormFactors(NamedTuple):
+    """Form factors of the probes of bodies to their own patches."""
+
+    matrix: SparseMatrix  # [probe, patch], of the bodies that send themselves light, and of all patches
+    first_probes: dict[int, int]  # where the probes of each of these bodies begin
+
+    def first_of(self, spans: Sequence[Span]) -> list[int]:
+        """Where the probes of each span's body begin; −1 for none."""
+        return [self.first_probes.get(span.body, -1) for span in spans]
 
 
 class SelfFormFactors:
@@ -35,10 +47,11 @@ class SelfFormFactors:
 
     def __init__(self, self_visibility: SelfVisibility, patches: ScenePatches, *, progress: bool = False):
         self._self_visibility, self._patches, self._progress = self_visibility, patches, progress
-        self._of_body: dict[int, SparseMatrix] = {}
+        self._of_body: dict[int, csr_matrix] = {}
+        self._of_senders: dict[Senders, ProbeFormFactors] = {}
         self._between: dict[Senders, SparseMatrix] = {}
 
-    def of(self, body: int) -> SparseMatrix:
+    def of(self, body: int) -> csr_matrix:
         """Form factors of each of a body's probes to its own patches."""
         if body not in self._of_body:
             merged_scene, probes = self._patches.merged_scene, self._self_visibility.probes(body)
@@ -47,9 +60,25 @@ class SelfFormFactors:
                 points, normals = np.tile(points, (2, 1)), np.concatenate([normals, -normals])
             vertices = probes.positions[: len(mesh.positions)]
             arguments = self._patches.of_body(body), vertices, mesh.surface.faces, points, normals
-            form_factors = self_form_factors(*arguments, device=merged_scene.device, progress=self._progress)
-            self._of_body[body] = SparseMatrix.from_matrix(form_factors, device=merged_scene.device)
+            self._of_body[body] = self_form_factors(*arguments, device=merged_scene.device, progress=self._progress)
         return self._of_body[body]
+
+    def of_senders(self, senders: Senders) -> ProbeFormFactors:
+        """Form factors of senders for themselves; flat and convex ones, which send themselves nothing, are left out."""
+        if senders not in self._of_senders:
+            from scipy.sparse import csr_matrix, vstack
+
+            patch_count, probe_count, first_probes = len(senders.areas), 0, {}
+            rows = [csr_matrix((0, patch_count), dtype=np.float32)]
+            for first, body in zip(senders.first.tolist(), senders.bodies, strict=False):
+                if not senders.merged_scene.is_flat[body] and (factors := self.of(body)).nnz:
+                    entries = factors.data, factors.indices + first, factors.indptr
+                    rows.append(csr_matrix(entries, (factors.shape[0], patch_count)))
+                    first_probes[body] = probe_count
+                    probe_count += factors.shape[0]
+            matrix = SparseMatrix.from_matrix(vstack(rows), device=senders.merged_scene.device)
+            self._of_senders[senders] = ProbeFormFactors(matrix, first_probes)
+        return self._of_senders[senders]
 
     def between_patches(self, senders: Senders, patch_samples: Sequence[Group]) -> SparseMatrix:
         """Form factors of each patch to other patches of its body, averaged over its patch samples."""
@@ -65,14 +94,15 @@ class SelfFormFactors:
         """Form factors of each patch sample of a group to the patches of its body, among all patches."""
         from scipy.sparse import csr_matrix
 
-        shape, body = (group.points.shape[1], len(senders.areas)), senders.receiver_body(group)
-        if body is None:
-            return csr_matrix(shape, dtype=np.float32)
-        factors, (probes, weights) = self.of(body.number).to_scipy(), (item.numpy()[0] for item in body.probe_weights)
-        starts = np.arange(0, probes.size + 1, 3)
-        of_patches = csr_matrix((weights.ravel(), probes.ravel(), starts), (shape[0], factors.shape[0])) @ factors
-        first = senders.first[senders.bodies.index(body.number)]
-        return csr_matrix((of_patches.data, of_patches.indices + first, of_patches.indptr), shape)
+        factors, spans = self.of_senders(senders), group.spans
+        first_probes = np.repeat(factors.first_of(spans), [span.end - span.first for span in spans])
+        if group.receiver_bodies is None or not (first_probes >= 0).any():
+            return csr_matrix((group.points.shape[1], len(senders.areas)), dtype=np.float32)
+        probes, weights = (item.numpy()[0] for item in group.receiver_bodies.probe_weights)
+        sends = first_probes[:, None] >= 0
+        entries = np.where(sends, weights, 0), np.where(sends, probes + first_probes[:, None], 0)
+        starts, shape = np.arange(0, probes.size + 1, 3), (len(probes), factors.matrix.shape[0])
+        return csr_matrix((*(item.ravel() for item in entries), starts), shape) @ factors.matrix.to_scipy()
 
 
 def self_form_factors(

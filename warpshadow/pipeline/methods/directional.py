@@ -106,7 +106,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
             of_spheres = self._past_spheres(group, horizon_normals, projected_light)
             past_spheres = of_spheres if past_spheres is None else multiply_transmittances(past_spheres, of_spheres)
         if points.size and group.convex_parts_around is not None:
-            cover = functools.partial(group.convex_parts_around.coverage, points, horizon_normals)
+            cover = functools.partial(group.coverage_around, horizon_normals)
             parts = self._coverages(cover, projected_light)
         # planes multiply their share in later; only bounces need the product without them, too
         if group.is_blocked_by_planes and not self.merged_scene.scene.bounces:
@@ -158,7 +158,9 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         self, group: Group, horizon_normals: wp.array | None, projected_light: ProjectedCells
     ) -> wp.array:
         arguments, scales = (group.points, horizon_normals, group.centers, group.radii), self._scales
-        block = functools.partial(directional.transmittance, *arguments, skip=group.skip, clusters=group.clusters)
+        block = functools.partial(
+            directional.transmittance, *arguments, body_spans=group.spans, skips=group.skips, clusters=group.clusters
+        )
         transmittance = block(projected_light.blocking_directions, **scales(1.0))
         if projected_light.sharp_cells is None:
             return transmittance
@@ -217,10 +219,10 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if group.self_blocking_parts is not None:
             coverages = self._coverages(group.self_coverage, projected_light)
             return self._past_coverages(None, coverages, None, projected_light)
-        transmittance_self, receiver_body = group.looked_up_transmittance(), group.receiver_body
-        if transmittance_self is None or receiver_body is None:
+        transmittance_self, bodies = group.looked_up_transmittance(), group.receiver_bodies
+        if transmittance_self is None or bodies is None or not isinstance(bodies.lookup, SelfVisibilityLookup):
             return None
-        rays = receiver_body.lookup.rays
+        rays = bodies.lookup.rays
         if rays is None or projected_light.sun is None:
             return transmittance_self
         if transmittance_self.requires_grad:
@@ -228,9 +230,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
                 'self_shadows: got "rays" where a pose or a camera has a gradient, which rays under a sun do not '
                 'have, expected "traced" or "spheres"'
             )
-        of_sun = trace_sun_cells(
-            rays[0], receiver_body.probe_weights, rays[1], receiver_body.number, projected_light.sun
-        )
+        of_sun = trace_sun_cells(rays[0], bodies.probe_weights, rays[1], bodies.number, projected_light.sun)
         return blend_sharp_cells(transmittance_self, of_sun, projected_light.sun.slots)
 
     def transfer(self, visibility: CellVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:

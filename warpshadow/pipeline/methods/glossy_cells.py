@@ -42,9 +42,8 @@ class ShadingAndTransmittance(NamedTuple):
 
 
 def _shading_and_cells(method: CellMethod, portion: LitPortion) -> tuple[wp.array, wp.array | None]:
-    """Shading of a portion, and the transmittance of its cells if its body shines."""
-    body = portion.group.body
-    is_glossy = body is not None and method.merged_scene.is_glossy[body]
+    """Shading of a portion, and the transmittance of its cells if its bodies shine."""
+    is_glossy = any(method.merged_scene.is_glossy[span.body] for span in portion.group.spans)
     return portion.result, _transmittance_of(portion) if is_glossy else None
 
 

@@ -73,7 +73,8 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
         if not points.size or (cached_rows is None and not radii.shape[1]):
             return HarmonicVisibility(None)
         if radii.shape[1]:
-            log = self._logs(points, group.normals, group.centers, radii, skip=group.skip, clusters=group.clusters)
+            arguments = points, group.normals, group.centers, radii
+            log = self._logs(*arguments, body_spans=group.spans, skips=group.skips, clusters=group.clusters)
         else:
             log = zeros((*points.shape, self._order**2), dtype=wp.float32, device=points.device)
         if cached_rows is not None:
@@ -103,12 +104,11 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
             lobes = zeros(visibility.coefficients.shape, dtype=wp.float32, device=visibility.coefficients.device)
             add_rows(group.cached_rows, lobes, channel=1)
             return lobes
-        if group.receiver_body is None or group.receiver_body.lookup is None or not group.points.size:
+        bodies = group.receiver_bodies
+        if bodies is None or not isinstance(bodies.lookup, SelfVisibilityLobes) or not group.points.size:
             return None
         bands = projected_light.bands if visibility.coefficients is None else self._order
-        return group.receiver_body.lookup.of_receivers(
-            group.receiver_body.probe_weights, order=self._order, bands=bands
-        )
+        return bodies.lookup.of_receivers(bodies.probe_weights, order=self._order, bands=bands)
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """The log-visibility of the static spheres, for any light, [row, 1, order²]; and lobes, if one has its own."""

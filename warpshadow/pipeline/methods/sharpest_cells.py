@@ -81,7 +81,7 @@ def find_share_of_sharpest_light(
         transmittance = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
     coverages = []
     if group.convex_parts_around is not None:
-        coverages.append(group.convex_parts_around.coverage(points, normals, directions, edge_radius))
+        coverages.append(group.coverage_around(normals, directions, edge_radius))
     planes = group.planes
     if planes is not None and group.is_blocked_by_planes:
         front_weights, points = group.fronts_of_planes

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+import itertools
+from collections.abc import Hashable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -16,15 +17,15 @@ from warpshadow.device.launch import varies
 from warpshadow.pipeline.bodies.convex import GroupConvexParts, SceneConvexParts
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.scene_planes import GroupPlanes, ScenePlanes
-from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
+from warpshadow.pipeline.bodies.self_visibility import SelfLookup, SelfVisibility, SelfVisibilityLookup
 from warpshadow.pipeline.receivers.shading_context import BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.stages.convex.convex_blockers import PlacedParts
 from warpshadow.stages.light.cached_cells import CachedRows
 from warpshadow.stages.planes.fronts import NearestBlockers, PlaneFronts, find_body_sides, find_fronts
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers
+from warpshadow.stages.receivers.body_spans import Span, relative_spans
 from warpshadow.stages.receivers.find import Receivers
-from warpshadow.stages.receivers.sample_receivers import Span
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 
@@ -56,31 +57,27 @@ class BodySides:
 
 
 @dataclass(frozen=True, eq=False)
-class ReceiverBody:
-    """The body on which the receivers of a group lie, which may block their light."""
+class ReceiverBodies:
+    """The bodies on which the receivers of a group lie, which may block their light."""
 
-    span: Span  # which receivers these are
+    spans: tuple[Span, ...]  # which receivers these are, by body
     receivers: Receivers  # among all
     self_visibility: SelfVisibility
-    lookup: Any  # traced self-visibility, of the method's kind; None where there is none, or its spheres block
-    is_solid: bool  # whether it blocks its own light as its convex parts do
-    parts: GroupConvexParts | None  # these, two or more: one alone never shades itself; else None
+    lookup: SelfLookup | None  # traced self-visibility; None where there is none, or their spheres block
+    is_solid: bool  # whether they block their own light as their convex parts do
+    parts: GroupConvexParts | None  # these, of one body, two or more: one alone never shades itself; else None
     body_sides: BodySides | None  # of all bodies; None without planes
 
     @property
     def number(self) -> int:
-        """Of the body."""
-        return self.span.body
+        """Of the body, where it is one."""
+        assert len({span.body for span in self.spans}) == 1
+        return self.spans[0].body
 
     @functools.cached_property
     def probe_weights(self) -> ProbeWeights:
-        """Where on it they lie."""
-        return self.self_visibility.probe_weights(self.receivers, self.span)
-
-    def cut(self, receivers: slice) -> ReceiverBody:
-        """Select some receivers."""
-        first = self.span.first
-        return replace(self, span=self.span._replace(first=first + receivers.start, end=first + receivers.stop))
+        """Where on them they lie."""
+        return self.self_visibility.probe_weights(self.receivers, self.spans)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +89,13 @@ class Group:
     centers: wp.array  # [batch, sphere] vec3
     radii: wp.array  # [batch, sphere] float32
     cached_rows: CachedRows | None = None  # of static bodies, which block their light, too
-    receiver_body: ReceiverBody | None = None  # where bodies are told apart
+    receiver_bodies: ReceiverBodies | None = None  # where bodies are told apart
     planes: GroupPlanes | None = None  # bodies that block as planes; None without any
     convex_parts_around: GroupConvexParts | None = None  # bodies that block as convex parts; None without any
     nearest_blockers: NearestBlockers | None = None  # None where receivers are not patch samples
-    skip: tuple[int, int] = (0, 0)  # spheres that do not block: the first, and the one after the last
+    self_spheres: Mapping[int, tuple[int, int]] = field(
+        default_factory=dict
+    )  # of bodies that do not block their own light by spheres
     clusters: ClusterTree | None = None  # of the spheres, where they are found already
     footprints: wp.array | None = None  # [batch, receiver] vec3, areas for which they stand; None for points
 
@@ -108,23 +107,41 @@ class Group:
     @property
     def body(self) -> int | None:
         """The body whose receivers they are, where bodies are told apart."""
-        return None if self.receiver_body is None else self.receiver_body.number
+        return None if self.receiver_bodies is None else self.receiver_bodies.number
+
+    @property
+    def spans(self) -> tuple[Span, ...]:
+        """The receivers by body, counted from the group's first; () where bodies are not told apart."""
+        return () if self.receiver_bodies is None else relative_spans(self.receiver_bodies.spans)
+
+    @property
+    def skips(self) -> tuple[tuple[int, int], ...]:
+        """Spheres that do not block light of each span: the first, and the one after the last."""
+        return tuple(self.self_spheres.get(span.body, (0, 0)) for span in self.spans)
 
     @property
     def self_blocking_parts(self) -> GroupConvexParts | None:
         """Convex parts of the receivers' own body that block their light; None without any."""
-        return None if self.receiver_body is None or not self.points.size else self.receiver_body.parts
+        return None if self.receiver_bodies is None or not self.points.size else self.receiver_bodies.parts
 
     def self_coverage(self, directions: np.ndarray, radius: float | None = None) -> wp.array:
         """Coverage of cells by them."""
         assert self.self_blocking_parts is not None
         return self.self_blocking_parts.coverage(self.points, self.normals, directions, radius)
 
+    def coverage_around(
+        self, horizon_normals: wp.array | None, directions: np.ndarray, radius: float | None = None
+    ) -> wp.array:
+        """Coverage of cells by convex parts of other bodies."""
+        assert self.convex_parts_around is not None
+        return self.convex_parts_around.coverage(self.points, horizon_normals, directions, radius, self.spans)
+
     def looked_up_transmittance(self) -> wp.array | None:
         """Transmittance past the receivers' own body, looked up, [batch, receiver, cell]; None without rows."""
-        if self.receiver_body is None or self.receiver_body.lookup is None or not self.points.size:
+        bodies = self.receiver_bodies
+        if bodies is None or not isinstance(bodies.lookup, SelfVisibilityLookup) or not self.points.size:
             return None
-        return self.receiver_body.lookup.transmittance(self.normals, self.receiver_body.probe_weights)
+        return bodies.lookup.transmittance(self.normals, bodies.probe_weights, self.spans)
 
     @functools.cached_property
     def fronts_of_planes(self) -> PlaneFronts:
@@ -134,22 +151,21 @@ class Group:
 
     def find_fronts(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> PlaneFronts:
         """Which part of each plane's front the receivers see, and the receivers lifted off planes they lie in."""
-        body_sides = None if self.receiver_body is None else self.receiver_body.body_sides
+        body_sides = None if self.receiver_bodies is None else self.receiver_bodies.body_sides
         sides = None if body_sides is None else body_sides.sides_of(frames, planes)
-        body = 0 if self.receiver_body is None else self.receiver_body.number
         arguments = self.points, self.normals, sides, self.nearest_blockers, frames, planes
-        return find_fronts(*arguments, body=body, skip=skip)
+        return find_fronts(*arguments, spans=self.spans, skip=skip)
 
     def portions(self) -> Iterator[Group]:
         """Portions of the receivers; all of them at once for a gradient, and where they have cached rows.
 
         All arrays of a portion have the same batch, if anything blocks.
         """
-        body, planes, clusters = self.receiver_body, self.planes, self.clusters
-        rotation_data = None if body is None or body.lookup is None else body.lookup.turned
-        positions = None if body is None or body.body_sides is None else body.body_sides.positions
+        bodies, planes, clusters = self.receiver_bodies, self.planes, self.clusters
+        rotation_data = None if bodies is None or bodies.lookup is None else bodies.lookup.turned
+        positions = None if bodies is None or bodies.body_sides is None else bodies.body_sides.positions
         frames = None if planes is None else planes.frames
-        parts = self.convex_parts_around or (None if body is None else body.parts)
+        parts = self.convex_parts_around or (None if bodies is None else bodies.parts)
         part_corners = None if parts is None else parts.placed_parts.corners
         arguments = points, normals, centers, radii = self.points, self.normals, self.centers, self.radii
         others = {"rotations": rotation_data, "planes": frames, "positions": positions, "parts": part_corners}
@@ -164,19 +180,33 @@ class Group:
             spheres = {"centers": centers, "radii": radii, "clusters": clusters}
             yield replace(self, points=points, normals=normals, footprints=footprints, **spheres)
             return
-        for start in range(0, size, RECEIVERS_AT_ONCE):
-            portion = slice(start, min(start + RECEIVERS_AT_ONCE, size))
+        offset = 0 if bodies is None else bodies.spans[0].first
+        for spans in _cut_spans((Span(-1, 0, size),) if bodies is None else bodies.spans):
+            portion = slice(spans[0].first - offset, spans[-1].end - offset)
             yield replace(
                 self,
                 points=points[:, portion].contiguous(),
                 normals=normals[:, portion].contiguous(),
                 centers=centers,
                 radii=radii,
-                receiver_body=None if body is None else body.cut(portion),
+                receiver_bodies=None if bodies is None else replace(bodies, spans=spans),
                 footprints=None if footprints is None else footprints[:, portion].contiguous(),
                 nearest_blockers=None if self.nearest_blockers is None else self.nearest_blockers.cut(portion),
                 clusters=clusters,
             )
+
+
+def _cut_spans(spans: Iterable[Span]) -> Iterator[tuple[Span, ...]]:
+    """Cut spans into portions of at most :data:`RECEIVERS_AT_ONCE` receivers."""
+    portion: list[Span] = []
+    for body, begin, end in spans:
+        for first in range(begin, end, RECEIVERS_AT_ONCE):
+            piece = Span(body, first, min(first + RECEIVERS_AT_ONCE, end))
+            if portion and piece.end - portion[0].first > RECEIVERS_AT_ONCE:
+                yield tuple(portion)
+                portion = []
+            portion.append(piece)
+    yield tuple(portion)
 
 
 class CellCoverages(NamedTuple):
@@ -252,10 +282,10 @@ class Blockers(NamedTuple):
     def convex_parts_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupConvexParts | None:
         """Convex parts of bodies around receivers of one body: all that block, or some."""
         bodies = self.blocker_kinds.convex
-        chosen, skip = _choose_blocking(bodies, body, of_bodies)
+        chosen, _ = _choose_blocking(bodies, body, of_bodies)
         if self.placed_parts is None or not chosen:
             return None
-        return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed_parts, skip)
+        return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed_parts, bodies)
 
     def self_blocking_parts(self, body: int) -> GroupConvexParts | None:
         """The convex parts of a body, where they block its own light: one alone does not."""
@@ -282,10 +312,11 @@ def _choose_blocking(
 def find_portions(
     receivers: Receivers,
     blockers: Blockers,
-    self_lookups: dict[int, Any] | None = None,
+    self_lookups: Mapping[int, SelfLookup] | None = None,
     cached_rows: CachedRows | None = None,
     static_normals: wp.array | None = None,
     *,
+    by_body: bool = False,
     static_bodies: StaticBodies | None,
     nearest_spheres: np.ndarray | None,
 ) -> Iterator[Group]:
@@ -297,6 +328,7 @@ def find_portions(
         self_lookups: Self-visibility of receivers, by body; None without any.
         cached_rows: Cached transmittance past static bodies, for receivers on them.
         static_normals: Normals of all vertices of static bodies; None where any may move.
+        by_body: Whether receivers of each body are a group of their own.
         static_bodies, nearest_spheres: As of the :class:`ShadingContext` that they are.
     """
     if static_bodies is not None and len(receivers.static_vertices):
@@ -309,12 +341,16 @@ def find_portions(
         yield from group.portions()
         if not receivers.points.shape[1]:
             return
-    for group in _groups_that_move(receivers, blockers, self_lookups or {}, nearest_spheres):
+    for group in _groups_that_move(receivers, blockers, self_lookups or {}, nearest_spheres, by_body):
         yield from group.portions()
 
 
 def _groups_that_move(
-    receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any], nearest_spheres: np.ndarray | None
+    receivers: Receivers,
+    blockers: Blockers,
+    self_lookups: Mapping[int, SelfLookup],
+    nearest_spheres: np.ndarray | None,
+    by_body: bool,
 ) -> Iterator[Group]:
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
     spheres, none = blockers.spheres_of(sphere_bodies), blockers.spheres_of([])
@@ -328,36 +364,52 @@ def _groups_that_move(
             nearest_blockers=nearest_blockers,
             footprints=receivers.footprints,
         )
-    for span in receivers.spans:
+        return
+    assert receivers.vertices is not None
+    vertex_count, kinds, merged_scene = receivers.vertices.size, blockers.blocker_kinds, blockers.merged_scene
+    self_spheres = {body: merged_scene.spheres_among(sphere_bodies, body) for body in kinds.self_traced}
+
+    def kind_of(span: Span) -> tuple[Hashable, ...]:
+        """All in which receivers of a group are the same; in the end their body, if it is alone in its group."""
+        body = span.body
+        is_alone = by_body or merged_scene.is_flat[body] or blockers.self_blocking_parts(body) is not None
+        if merged_scene.scene.bounces and body not in self_lookups and body not in kinds.solids:
+            is_alone = True
+        has_spheres = self_spheres.get(body, (0, 0)) != (0, spheres[1].shape[1])
+        is_glossy, has_parts = (
+            body >= 0 and merged_scene.is_glossy[body],
+            blockers.convex_parts_around(body) is not None,
+        )
+        kind = IdentityKey(self_lookups.get(body)), is_glossy, has_parts, body if is_alone else body >= 0
+        return span.first < vertex_count, has_spheres, *kind
+
+    for (is_at_vertices, has_spheres, *_), consecutive in itertools.groupby(receivers.spans, kind_of):
+        spans = tuple(consecutive)
+        body, first, end = spans[0].body, spans[0].first, spans[-1].end
         points_and_normals = receivers.points, receivers.normals
-        assert receivers.vertices is not None
-        is_at_vertices = span.first < receivers.vertices.size
         if is_at_vertices and len(blockers.positions) == 1 < len(receivers.points):  # all cameras see the same vertices
             points_and_normals = receivers.points[:1], receivers.normals[:1]
-        is_traced = span.body in blockers.blocker_kinds.self_traced
-        skip = blockers.merged_scene.spheres_among(sphere_bodies, span.body) if is_traced else (0, 0)
-        others = none if skip == (0, spheres[1].shape[1]) else spheres
-        points, normals = (cut(array, span.first, span.end) for array in points_and_normals)
-        planes, parts = blockers.planes_around(span.body), blockers.convex_parts_around(span.body)
-        group = Group(points, normals, *others, planes=planes, convex_parts_around=parts)
+        points, normals = (cut(array, first, end) for array in points_and_normals)
+        planes, parts = blockers.planes_around(body), blockers.convex_parts_around(body)
+        group = Group(points, normals, *(spheres if has_spheres else none), planes=planes, convex_parts_around=parts)
         if receivers.footprints is not None and not is_at_vertices:
-            group = replace(group, footprints=cut(receivers.footprints, span.first, span.end))
-        if others is spheres:
+            group = replace(group, footprints=cut(receivers.footprints, first, end))
+        if has_spheres:
             clusters = clusters or find_clusters(*spheres, blockers.merging)
-            group = replace(group, skip=skip, clusters=clusters)
-        if span.body >= 0:
-            receiver_body = ReceiverBody(
-                span,
+            group = replace(group, self_spheres=self_spheres, clusters=clusters)
+        if body >= 0:
+            receiver_bodies = ReceiverBodies(
+                spans,
                 receivers,
                 blockers.self_visibility,
-                self_lookups.get(span.body),
-                span.body in blockers.blocker_kinds.solids,
-                blockers.self_blocking_parts(span.body),
+                self_lookups.get(body),
+                body in kinds.solids,
+                blockers.self_blocking_parts(body),
                 blockers.body_sides,
             )
-            group = replace(group, receiver_body=receiver_body)
+            group = replace(group, receiver_bodies=receiver_bodies)
         if nearest_blockers is not None:
-            group = replace(group, nearest_blockers=nearest_blockers.cut(slice(span.first, span.end)))
+            group = replace(group, nearest_blockers=nearest_blockers.cut(slice(first, end)))
         yield group
 
 

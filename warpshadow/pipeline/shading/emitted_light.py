@@ -156,7 +156,7 @@ def _find_transmittances(
             find_transmittance_to_samples(
                 log_of_spheres=find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped),
                 log_of_planes=_log_of_planes(group, blockers, placed_samples, span, body),
-                log_of_parts=_log_of_parts(group, blockers, placed_samples, span, body),
+                log_of_parts=_log_of_parts(group, placed_samples, span, body),
                 transmittance_self=transmittance_self,
                 transmittance_of_emitter=weigh_by_beam(points, placed_samples, span, transmittance_of_emitter),
             ),
@@ -238,14 +238,12 @@ def _log_of_planes(
     )
 
 
-def _log_of_parts(
-    group: Group, blockers: Blockers, placed_samples: PlacedSamples, span: EmitterSpan, body: int
-) -> wp.array | None:
+def _log_of_parts(group: Group, placed_samples: PlacedSamples, span: EmitterSpan, body: int) -> wp.array | None:
     """Logarithm of the transmittance of convex parts between a group and an emitter; None without any."""
-    parts, numbers = group.convex_parts_around, blockers.blocker_kinds.convex
+    parts = group.convex_parts_around
     if parts is None:
         return None
-    skipped = -1 if parts.skip is None else parts.skip, numbers.index(body) if body in numbers else -1
+    skipped = -1 if group.body is None else parts.number_of(group.body), parts.number_of(body)
     return find_log_transmittance_of_parts(
         group.points, group.normals, placed_samples, span, parts.placed_parts, parts.blockers, skipped
     )

@@ -3,7 +3,7 @@
 import abc
 import functools
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -15,6 +15,7 @@ from warpshadow.device.constants import IdentityKey
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
+from warpshadow.pipeline.bodies.self_visibility import SelfLookup
 from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached, identity
 from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_portions
 from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, BlockerKinds, ShadingContext, receiver_text
@@ -154,8 +155,10 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         """Number of light coefficients that shading uses; all of them where the light is None, not known yet."""
 
     @abc.abstractmethod
-    def self_lookups(self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Projected) -> dict[int, Any]:
-        """Self-visibility of receivers of some bodies, :attr:`.ReceiverBody.lookup`. Differentiable: rotations."""
+    def self_lookups(
+        self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Projected
+    ) -> Mapping[int, SelfLookup]:
+        """Self-visibility of receivers of some bodies, :attr:`.ReceiverBodies.lookup`. Differentiable: rotations."""
 
     @abc.abstractmethod
     def find_visibility(self, group: Group, projected_light: Projected) -> FoundVisibility:
@@ -209,10 +212,10 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         self, name: str, find: Callable[..., Any], points: ShadingContext, materials: Materials, *others: Node | Input
     ) -> Node:
         emitters, weak_points = self.emitters, points.weak_reference
-        portions_of = _find_portions_of(points)
+        portions_of = _find_portions_of(points, by_body=True)
 
         def find_in_portions(
-            receivers: Receivers, blockers: Blockers, self_lookups: dict[int, Any] | None, *arrays: Any
+            receivers: Receivers, blockers: Blockers, self_lookups: Mapping[int, SelfLookup] | None, *arrays: Any
         ) -> Any:
             portions = portions_of(receivers, blockers, self_lookups)
             return find(emitters.samples, emitters.self_visibility, portions, blockers, *arrays)
@@ -407,9 +410,11 @@ class ShadingNode(TransferNode):
         return portion._replace(result=result)
 
 
-def _find_portions_of(points: ShadingContext) -> Callable[..., Iterator[Group]]:
+def _find_portions_of(points: ShadingContext, *, by_body: bool = False) -> Callable[..., Iterator[Group]]:
     """Make :func:`find_portions` for the receivers of points, without a reference to these."""
-    return functools.partial(find_portions, static_bodies=points.static_bodies, nearest_spheres=points.nearest_spheres)
+    return functools.partial(
+        find_portions, by_body=by_body, static_bodies=points.static_bodies, nearest_spheres=points.nearest_spheres
+    )
 
 
 def _why_unblocked(method: SphereMethod, points: ShadingContext) -> str:

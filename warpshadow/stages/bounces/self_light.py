@@ -1,4 +1,6 @@
-"""Self light: light from a rigid body's patches to the body itself, by form factors that are computed once."""
+"""Self light: light from rigid bodies' patches to each body itself, by form factors that are computed once."""
+
+from collections.abc import Sequence
 
 import warp as wp
 
@@ -7,13 +9,23 @@ from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.raster.interpolation import interpolate_at
-from warpshadow.stages.sparse import SparseMatrix, multiply
+from warpshadow.stages.receivers.body_spans import (
+    ReceiverSpans,
+    Span,
+    SpanValues,
+    receiver_spans,
+    span_of_receiver,
+    span_values,
+    value_of_span,
+)
 
 
 @wp.kernel
 def _interpolate_probes(
     # in
     probe_light: wp.array2d(dtype=wp.vec3),
+    spans: ReceiverSpans,
+    first_probes: SpanValues,
     probe_indices: wp.array2d(dtype=wp.vec3i),
     weights: wp.array2d(dtype=wp.vec3),
     addend: wp.array2d(dtype=wp.vec3),
@@ -24,39 +36,46 @@ def _interpolate_probes(
     batch, receiver = wp.tid()
     light_batch = instance_in(batch, probe_light.shape[0])
     probe_batch = instance_in(batch, probe_indices.shape[0])
-    receiver_light = interpolate_at(
-        probe_light[light_batch], probe_indices[probe_batch, receiver], weights[probe_batch, receiver]
-    )
+    receiver_light = wp.vec3()
+    first_probe = value_of_span(first_probes, span_of_receiver(spans, receiver))
+    if first_probe >= 0:
+        probes = probe_indices[probe_batch, receiver] + wp.vec3i(first_probe, first_probe, first_probe)
+        receiver_light += interpolate_at(probe_light[light_batch], probes, weights[probe_batch, receiver])
     if addend:
         receiver_light += addend[instance_in(batch, addend.shape[0]), receiver]
     light[batch, receiver] = receiver_light
 
 
 def self_light(
-    form_factors: SparseMatrix,
-    radiosity: wp.array,
+    probe_light: wp.array,
     probe_indices: wp.array,
     weights: wp.array,
     addend: wp.array | None = None,
+    *,
+    body_spans: Sequence[Span] = (),
+    first_probes: Sequence[int] = (0,),
 ) -> wp.array:
-    """Light that receivers of a body get from the body itself, added to other light; it does not depend on the pose.
+    """Light that receivers get from their own body, added to other light; it does not depend on the pose.
 
         I_x = c_x + Σ_k w_xk Σ_p F_(row k of x)p B_p
 
     Args:
-        form_factors: F of the body's probes, of shape [probe, patch], as :func:`.form_factors.trace_form_factors`
-            traces it.
-        radiosity: Of the body's patches, vec3 of shape [batch, patch].
-        probe_indices: Probes around each receiver, vec3i of shape [batch, receiver].
+        probe_light: F B, vec3 of shape [batch, probe]: form factors of the probes of bodies to their own patches, as
+            :func:`.form_factors.trace_form_factors` traces them, times the radiosity of these.
+        probe_indices: Probes of its body around each receiver, vec3i of shape [batch, receiver].
         weights: Their weights, vec3 of shape [batch, receiver].
         addend: c, vec3 of shape [batch, receiver]; None for 0.
+        body_spans: Of the receivers, by body; () for one of all.
+        first_probes: Where the probes of each span's body begin; −1 for a body that sends itself nothing.
     Returns:
         Light that a white receiver reflects of it, vec3 of shape [batch, receiver].
-    Differentiable: radiosity, weights, addend. Not: form_factors, probe_indices.
+    Differentiable: probe_light, weights, addend. Not: probe_indices.
     """
     check.shape("weights", weights.shape, probe_indices.shape)
-    probe_light = multiply(form_factors, radiosity)
-    batch_count = common_batch({"radiosity": radiosity, "probe_indices": probe_indices, "addend": addend})
-    light = empty((batch_count, probe_indices.shape[1]), dtype=wp.vec3, device=radiosity.device)
-    launch(_interpolate_probes, light.shape, inputs=[probe_light, probe_indices, weights, addend], outputs=[light])
+    batch_count = common_batch({"probe_light": probe_light, "probe_indices": probe_indices, "addend": addend})
+    receiver_count, device = probe_indices.shape[1], probe_light.device
+    light = empty((batch_count, receiver_count), dtype=wp.vec3, device=device)
+    spans = receiver_spans(body_spans, receiver_count, 1, device)
+    inputs = [probe_light, spans, span_values(first_probes, device), probe_indices, weights, addend]
+    launch(_interpolate_probes, light.shape, inputs=inputs, outputs=[light])
     return light

@@ -14,6 +14,7 @@ The traversal is that of the transmittance, with other visits. For the adjoint t
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.bounces.proxy_weights import WeightInputs, make_weight_functions
 from warpshadow.stages.bounces.tangent_planes import TangentPlanes
 from warpshadow.stages.light.sums import begin_sum
+from warpshadow.stages.receivers.body_spans import ReceiverBlock, Span
 from warpshadow.stages.visibility.cones import TINY_RADIUS
 from warpshadow.stages.visibility.culling import (
     DirectionCells,
@@ -108,14 +110,16 @@ def _make_load_task(lanes: int) -> wp.Function:
     load_receivers, is_bundle_above = make_load_receivers(True, lanes), make_is_bundle_above(True, lanes)
 
     @wp.func(inline=True)
-    def load_blocked(batch: int, block: int, bundle: int, inputs: LightInputs, task: LightTask):
+    def load_blocked(block: ReceiverBlock, bundle: int, inputs: LightInputs, task: LightTask):
         """Load F − T of a bundle's cells; returns whether it is not 0 anywhere."""
         first_slot = bundle * BUNDLE
         first_direction = (task.first_bundle + bundle) * BUNDLE
-        load_columns(inputs.transmittance[batch], first_direction, BUNDLE, block, 1.0, task.blocked, first_slot)
+        rows = inputs.transmittance[block.batch][block.first : block.end]
+        load_columns(rows, first_direction, BUNDLE, block.number, 1.0, task.blocked, first_slot)
         if inputs.transmittance_others:
-            others = inputs.transmittance_others[instance_in(batch, inputs.transmittance_others.shape[0])]
-            load_columns(others, first_direction, BUNDLE, block, 1.0, task.transmittance_others, first_slot)
+            others = inputs.transmittance_others[instance_in(block.batch, inputs.transmittance_others.shape[0])]
+            rows_others = others[block.first : block.end]
+            load_columns(rows_others, first_direction, BUNDLE, block.number, 1.0, task.transmittance_others, first_slot)
         is_any_blocked = bool(False)
         for slot in range(first_slot, first_slot + BUNDLE):
             cell_transmittance_others = Lane(1.0)
@@ -136,7 +140,8 @@ def _make_load_task(lanes: int) -> wp.Function:
         reached_bundles: wp.array3d(dtype=wp.int32),
         sums: wp.array2d(dtype=Lane),
     ):
-        batch, block, receivers = load_receivers(inputs.traversed, row)
+        block, receivers = load_receivers(inputs.traversed, row)
+        batch = block.batch
         spheres = inputs.traversed.spheres
         item = row * inputs.span_count + span
         slot = scratch_slot(worker, item)
@@ -162,9 +167,9 @@ def _make_load_task(lanes: int) -> wp.Function:
         for bundle in range(task.stops.shape[0]):
             task.stops[bundle] = 0
             is_above = is_bundle_above(task.cells, task.first_bundle + bundle, receivers.normals)
-            if is_above and load_blocked(batch, block, bundle, inputs, task):
+            if is_above and load_blocked(block, bundle, inputs, task):
                 task.stops[bundle] = spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
-        return batch, block, receivers, task
+        return block, receivers, task
 
     return load_task
 
@@ -232,12 +237,12 @@ def _make_light(lanes: int) -> wp.Kernel:
         """A thread owns a block of receivers and a span of bundles, and adds to the light."""
         i, j = wp.tid()
         span, row = split_launch(worker, first_row + i, j)
-        batch, block, receivers, task = load_task(row, span, worker, inputs, scratch, reached_bundles, sums)
+        block, receivers, task = load_task(row, span, worker, inputs, scratch, reached_bundles, sums)
         for bundle in range(task.stops.shape[0]):
             if task.stops[bundle] > 0:
                 for k in range(BUNDLE * SUMS):
                     task.sums[bundle * BUNDLE * SUMS + k] = Lane(0.0)
-        traverse(receivers, batch, inputs.traversed.spheres, Gradients(), task)
+        traverse(receivers, block.batch, inputs.traversed.spheres, Gradients(), task)
         light_sum = Vectors()
         for bundle in range(task.stops.shape[0]):
             if task.stops[bundle] > 0:
@@ -250,7 +255,7 @@ def _make_light(lanes: int) -> wp.Kernel:
                     light_sum.x += wp.cw_mul(weight_factor, task.sums[slot * SUMS])
                     light_sum.y += wp.cw_mul(weight_factor, task.sums[slot * SUMS + 1])
                     light_sum.z += wp.cw_mul(weight_factor, task.sums[slot * SUMS + 2])
-        add_vectors(light_sum, block, light[batch])
+        add_vectors(light_sum, block.number, light[block.batch][block.first : block.end])
 
     return add_light
 
@@ -360,8 +365,9 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         """
         i, j = wp.tid()
         span, row = split_launch(worker, first_row + i, j)
-        batch, block, receivers, task = load_task(row, span, worker, inputs, scratch, reached_bundles, sums)
-        task.adj_light = load(adj_light[batch], block)
+        block, receivers, task = load_task(row, span, worker, inputs, scratch, reached_bundles, sums)
+        batch = block.batch
+        task.adj_light = load(adj_light[batch][block.first : block.end], block.number)
         if adj_radiance:
             task.adj_radiance = adj_radiance[instance_in(batch, inputs.proxy_radiance.shape[0])]
         if adj_equations:
@@ -373,20 +379,21 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
                 first_slot = bundle * BUNDLE
                 first_direction = (task.first_bundle + bundle) * BUNDLE
                 if adj_transmittance:
-                    rows = adj_transmittance[batch]
-                    add_columns(-1.0, task.adj_blocked, first_slot, rows, first_direction, BUNDLE, block)
+                    rows = adj_transmittance[batch][block.first : block.end]
+                    add_columns(-1.0, task.adj_blocked, first_slot, rows, first_direction, BUNDLE, block.number)
                 if adj_transmittance_others:
-                    rows_others = adj_transmittance_others[instance_in(batch, adj_transmittance_others.shape[0])]
-                    add_columns(1.0, task.adj_blocked, first_slot, rows_others, first_direction, BUNDLE, block)
+                    others = adj_transmittance_others[instance_in(batch, adj_transmittance_others.shape[0])]
+                    rows_others = others[block.first : block.end]
+                    add_columns(1.0, task.adj_blocked, first_slot, rows_others, first_direction, BUNDLE, block.number)
         adj_receivers = traverse(
             receivers, batch, inputs.traversed.spheres, Gradients(adj_centers, adj_radii, adj_extents), task
         )
         if adj_points:
-            add_vectors(adj_receivers.points, block, adj_points[batch])
+            add_vectors(adj_receivers.points, block.number, adj_points[batch][block.first : block.end])
         if adj_normals:
-            add_vectors(adj_normal, block, adj_normals[batch])
+            add_vectors(adj_normal, block.number, adj_normals[batch][block.first : block.end])
         if adj_addend and span == 0:
-            add_vectors(task.adj_light, block, adj_addend[batch])
+            add_vectors(task.adj_light, block.number, adj_addend[batch][block.first : block.end])
 
     return add_light_adjoint
 
@@ -403,7 +410,8 @@ def sphere_light(
     *,
     softness: float = SOFTNESS,
     merging: float = MERGING,
-    skip: tuple[int, int] = (0, 0),
+    body_spans: Sequence[Span] = (),
+    skips: Sequence[tuple[int, int]] = (),
     clusters: ClusterTree | None = None,
     tangent_planes: TangentPlanes | None = None,
     addend: wp.array | None = None,
@@ -411,12 +419,12 @@ def sphere_light(
     """Light that proxies send to receivers, through the cells that they block, added to other light.
 
     Args:
-        points, normals, centers, radii, directions, softness, merging, skip, clusters: As for
-            :func:`warpshadow.stages.visibility.directional.transmittance`.
+        points, normals, centers, radii, directions, softness, merging, body_spans, skips, clusters: As
+            for :func:`warpshadow.stages.visibility.directional.transmittance`.
         proxy_radiance: Light and area that proxies, clusters included, show towards cells, vec4 of shape [batch, proxy,
             direction], from :func:`.proxy_radiance.find_proxy_radiance`.
         transmittance: T past these spheres and all else that F is past, float32 of shape [batch, receiver, direction],
-            made with the same directions, softness, merging and skip.
+            made with the same directions, softness, merging and skips.
         transmittance_others: F, the factor of T without these spheres, of the same shape; None for 1.
         tangent_planes: Of the proxies, which show nothing below them; None for proxies that are seen from everywhere.
             Batches of 1 of these, of proxy_radiance and of transmittance_others serve every instance.
@@ -428,12 +436,11 @@ def sphere_light(
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii of receivers and spheres, as the transmittance.
     Differentiable: points, normals, centers, radii, proxy_radiance, transmittance, transmittance_others, equations of
     the tangent planes, addend. (The derivative in T is the one at a fixed blend of proxies.) Not: directions, softness,
-    merging, skip, clusters, tolerances.
+    merging, skips, clusters, tolerances.
     """
     cells = make_cells(directions, softness, points.device)
-    traversal = prepare_traversal(
-        points, normals, centers, radii, cell_radius(len(directions)), merging=merging, skip=skip, clusters=clusters
-    )
+    arguments = points, normals, centers, radii, cell_radius(len(directions))
+    traversal = prepare_traversal(*arguments, merging=merging, body_spans=body_spans, skips=skips, clusters=clusters)
     equations, tolerances = (None, None) if tangent_planes is None else tangent_planes
     common_batch(
         {

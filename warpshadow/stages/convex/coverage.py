@@ -16,6 +16,7 @@ window's light through, and a room behind a blind would be 24% off instead of 6%
 """
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,14 +24,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, instance_in
-from warpshadow.device.lanes import (
-    block_count,
-    lane_count,
-    lane_type,
-    make_lane_functions,
-    module_options,
-    vectors_type,
-)
+from warpshadow.device.lanes import lane_count, lane_type, make_lane_functions, module_options, vectors_type
 from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_slot
@@ -39,6 +33,7 @@ from warpshadow.stages.convex.convex_blockers import ConvexBlockers, PlacedParts
 from warpshadow.stages.convex.joint_lanes import coverage_type, make_joint_functions, sums_type
 from warpshadow.stages.convex.part_bounds import PartInputs, make_bound_functions, task_type
 from warpshadow.stages.convex.silhouette import ADJOINT_LANES, EDGE_LANES, SUM_LANES, make_silhouette_functions
+from warpshadow.stages.receivers.body_spans import Span, make_find_span, receiver_spans, span_values, value_of_span
 from warpshadow.stages.visibility.culling import make_cells
 from warpshadow.stages.visibility.directional import SOFTNESS
 
@@ -51,7 +46,7 @@ class _PartFunctions(NamedTuple):
     prepare_block: wp.Function
     is_blocking: wp.Function
     cover_by_compound: wp.Function
-    cover_by_all: wp.Function
+    cover_by_all_compounds: wp.Function
 
 
 @functools.cache
@@ -61,7 +56,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     PartsTask, Coverages, SumsOfBlockers = task_type(lanes), coverage_type(lanes), sums_type(lanes)
     fn, silhouettes, joint = make_lane_functions(lanes), make_silhouette_functions(lanes), make_joint_functions(lanes)
     is_any_above, dot, scale, add, is_positive = fn.is_any_above, fn.dot, fn.scale, fn.add, fn.is_positive
-    find_block, load = fn.find_block, fn.load
+    load, find_span = fn.load, make_find_span(lanes)
     find_bound, reaches_bundle, find_reach = make_bound_functions(lanes)
     find_silhouette, find_coverage = silhouettes.find_silhouette, silhouettes.find_coverage
     no_blockers, with_blocker = joint.no_blockers, joint.with_blocker
@@ -80,17 +75,17 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         numbers: wp.array3d(dtype=wp.int32),
     ):
         """Load a block of receivers; nothing is covered yet."""
-        batch, block = find_block(row, inputs.points.shape[1])
-        slot, instance = scratch_slot(worker, row), instance_in(batch, inputs.corners.shape[0])
+        block = find_span(inputs.spans, row)
+        slot, instance = scratch_slot(worker, row), instance_in(block.batch, inputs.corners.shape[0])
         task = PartsTask()
-        task.batch = batch
         task.block = block
+        task.skip = value_of_span(inputs.skips, block.span)
         task.slot = slot
         task.instance = instance
         task.bounds = inputs.bounds[instance]
-        task.points = load(inputs.points[batch], block)
+        task.points = load(inputs.points[block.batch][block.first : block.end], block.number)
         if inputs.horizon_normals:
-            task.normals = load(inputs.horizon_normals[batch], block)
+            task.normals = load(inputs.horizon_normals[block.batch][block.first : block.end], block.number)
         task.lift = Lane(1.0) - is_positive(dot(task.normals, task.normals))
         task.coverage = coverage[slot]
         task.is_hull = is_hull[slot]
@@ -109,10 +104,10 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         return task
 
     @wp.func
-    def is_blocking(inputs: PartInputs, compound: int):
+    def is_blocking(inputs: PartInputs, compound: int, skip: int):
         """Whether a compound blocks light of the receivers."""
         piece = inputs.parts.first_piece[compound]
-        return inputs.parts.bodies[piece] != inputs.skip and inputs.parts.blocks[piece] == 1
+        return inputs.parts.bodies[piece] != skip and inputs.parts.blocks[piece] == 1
 
     @wp.func
     def bound_by_hull(inputs: PartInputs, hull: int, task: PartsTask, covered_count: int):
@@ -181,17 +176,17 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         return covered_count
 
     @wp.func
-    def cover_by_all(inputs: PartInputs, task: PartsTask):
+    def cover_by_all_compounds(inputs: PartInputs, task: PartsTask):
         """Store sums over all compounds for each cell."""
         for compound in range(inputs.parts.hulls.shape[0]):
-            if is_blocking(inputs, compound):
+            if is_blocking(inputs, compound, task.skip):
                 covered_count = cover_by_compound(inputs, compound, task)
                 for k in range(covered_count):
                     q = task.covered[k]
                     task.sums[q] = with_blocker(task.sums[q], task.coverage[q])
                     task.coverage[q] = Coverages()
 
-    return _PartFunctions(prepare_block, is_blocking, cover_by_compound, cover_by_all)
+    return _PartFunctions(prepare_block, is_blocking, cover_by_compound, cover_by_all_compounds)
 
 
 @functools.cache
@@ -199,7 +194,7 @@ def _make_cover(lanes: int) -> wp.Kernel:
     Lane, Coverages, SumsOfBlockers = lane_type(lanes), coverage_type(lanes), sums_type(lanes)
     fn, functions, joint = make_lane_functions(lanes), _make_part_functions(lanes), make_joint_functions(lanes)
     is_any_above, joint_coverage, store_columns = fn.is_any_above, joint.joint_coverage, joint.store_columns
-    prepare_block, _, _, cover_by_all = functions
+    prepare_block, _, _, cover_by_all_compounds = functions
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def cover_cells(
@@ -221,11 +216,12 @@ def _make_cover(lanes: int) -> wp.Kernel:
         """A thread owns a block of receivers."""
         row = first_row + wp.tid()
         task = prepare_block(row, worker, inputs, coverage, is_hull, covered, sums, chord_sums, edges, numbers)
-        cover_by_all(inputs, task)
+        cover_by_all_compounds(inputs, task)
         for q in range(task.coverage.shape[0]):
             if is_any_above(task.sums[q].total, 0.0):
                 task.coverage[q] = joint_coverage(task.sums[q])
-        store_columns(task.coverage, task.block, result[task.batch])
+        block = task.block
+        store_columns(task.coverage, block.number, result[block.batch][block.first : block.end])
 
     return cover_cells
 
@@ -239,7 +235,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
     add, add_vectors = fn.add, fn.add_vectors
     joint_coverage_adjoint, blocker_adjoint = joint.joint_coverage_adjoint, joint.blocker_adjoint
     load_columns = joint.load_columns
-    prepare_block, is_blocking, cover_by_compound, cover_by_all = functions
+    prepare_block, is_blocking, cover_by_compound, cover_by_all_compounds = functions
     find_bound, _, find_reach = make_bound_functions(lanes)
     find_silhouette, _find_coverage, coverage_adjoint, silhouette_adjoint = make_silhouette_functions(lanes)
     ADJOINT_STRIDE = wp.constant(ADJOINT_LANES)
@@ -279,8 +275,9 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
         task = prepare_block(row, worker, inputs, coverage, is_hull, covered, sums, chord_sums, edges, numbers)
         task.silhouette.adj_edges = adj_edges[task.slot]
         parts, radius = inputs.parts, inputs.radius
-        cover_by_all(inputs, task)
-        load_columns(adj_result[task.batch], task.block, task.coverage)
+        cover_by_all_compounds(inputs, task)
+        block = task.block
+        load_columns(adj_result[block.batch][block.first : block.end], block.number, task.coverage)
         for q in range(task.coverage.shape[0]):
             adj_sums[task.slot, q] = SumsOfBlockers()
             if is_any_above(task.sums[q].total, 0.0):
@@ -290,7 +287,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
         adj_point = Vectors()
         for compound in range(parts.hulls.shape[0]):
             covered_count = int(0)
-            if is_blocking(inputs, compound):
+            if is_blocking(inputs, compound, task.skip):
                 covered_count = cover_by_compound(inputs, compound, task)
             affected_count = int(0)
             for k in range(covered_count):
@@ -338,7 +335,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
                 for k in range(affected_count):
                     task.coverage[task.covered[k]] = Coverages()
         if adj_points:
-            add_vectors(adj_point, task.block, adj_points[task.batch])
+            add_vectors(adj_point, block.number, adj_points[block.batch][block.first : block.end])
 
     return cover_cells_adjoint
 
@@ -351,7 +348,8 @@ def part_coverage(
     *,
     radius: float | None = None,
     horizon_normals: wp.array | None = None,
-    skip: int | None = None,
+    body_spans: Sequence[Span] = (),
+    skips: Sequence[int] = (-1,),
     on_surface: bool = False,
 ) -> wp.array:
     """Coverage (h, μ) of cells by the convex parts of bodies.
@@ -362,7 +360,8 @@ def part_coverage(
         directions: Unit vectors ω of the cells, NumPy of shape [direction, 3].
         radius: Of cells that do not tile the sphere [rad]; by default that of so many even ones, which do.
         horizon_normals: Normals, vec3 of shape [batch, receiver]: nothing blocks cells below the horizon.
-        skip: Number of the body that the receivers are part of, which blocks none of their light; None for none.
+        body_spans: Of the receivers, by body; () for one of all.
+        skips: Number of each span's body among the blockers, which blocks none of its light; −1 for none.
         on_surface: Whether receivers lie on the parts, which are those of one body, and have ``horizon_normals``: a
             part blocks no light of receivers that lie on a face of it and look out, nor below their tangent planes.
 
@@ -373,8 +372,8 @@ def part_coverage(
     """
     check.shape("points", points.shape, ("batch", "receiver"))
     check.shape("directions", directions.shape, ("direction", 3))
-    if skip is not None:
-        check.choice("skip", skip, range(blockers.body_count))
+    for skip in skips:
+        check.choice("skips", skip, range(-1, blockers.body_count))
     points = expand(points, common_batch({"points": points, "corners": placed_parts.corners}))
     inputs = PartInputs()
     inputs.points, inputs.parts, inputs.cells = points, blockers.arrays, make_cells(directions, SOFTNESS, points.device)
@@ -382,7 +381,8 @@ def part_coverage(
         inputs.horizon_normals = horizon_normals
     inputs.corners, inputs.face_planes, inputs.bounds = placed_parts
     inputs.radius = cell_radius(len(directions)) if radius is None else radius
-    inputs.skip = -1 if skip is None else skip
+    inputs.spans = receiver_spans(body_spans, points.shape[1], lane_count(points.device), points.device)
+    inputs.skips = span_values(skips, points.device)
     inputs.on_surface = on_surface
     lanes = lane_count(points.device)
     Lane, sums, edge_count = lane_type(lanes), sums_type(lanes), blockers.edge_count
@@ -391,7 +391,7 @@ def part_coverage(
     return launch_with_adjoint(
         _make_cover(lanes),
         lambda: _make_cover_adjoint(lanes),
-        points.shape[0] * block_count(points.shape[1], lanes),
+        points.shape[0] * inputs.spans.block_count,
         inputs=[inputs],
         result=empty((*points.shape, len(directions)), dtype=wp.vec4, device=points.device),
         variables=[points],

@@ -9,6 +9,7 @@ from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
 from warpshadow.stages.convex.convex_blockers import UNSEEN, ConvexArrays
 from warpshadow.stages.convex.joint_lanes import coverage_type, sums_type
 from warpshadow.stages.convex.silhouette import silhouette_type
+from warpshadow.stages.receivers.body_spans import ReceiverBlock, ReceiverSpans, SpanValues
 from warpshadow.stages.visibility.culling import DirectionCells
 
 _BOUND_MARGIN = 1.001  # bounds are so much larger, for rounding
@@ -33,7 +34,8 @@ class PartInputs:
     parts: ConvexArrays
     cells: DirectionCells
     radius: float  # of cells
-    skip: int  # the body that the receivers are part of, −1 for none
+    spans: ReceiverSpans
+    skips: SpanValues  # the body that the receivers are part of, −1 for none
     on_surface: bool  # whether receivers lie on the parts, which then are those of one body
 
 
@@ -45,8 +47,8 @@ def task_type(lanes: int) -> Any:
 
     @wp.struct
     class PartsTask:
-        batch: int
-        block: int
+        block: ReceiverBlock
+        skip: int  # the body that the receivers are part of, −1 for none
         slot: int  # of scratch memory
         instance: int  # of the parts
         bounds: wp.array(dtype=wp.vec4)  # [part]

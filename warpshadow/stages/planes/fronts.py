@@ -29,6 +29,7 @@ changes over the depth of a sphere, not of a margin. 1.25 leaves room for sphere
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +41,15 @@ from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneGrid
+from warpshadow.stages.receivers.body_spans import (
+    ReceiverSpans,
+    Span,
+    SpanValues,
+    receiver_spans,
+    span_of_receiver,
+    span_values,
+    value_of_span,
+)
 
 _FRONT_RADIUS_RATIO = wp.constant(1.25)
 """A patch sample is wholly in front of a plane where its height and its sphere's add up to 1/1.25 of the sphere's
@@ -172,7 +182,8 @@ def _find_fronts(
     points: wp.array2d(dtype=wp.vec3),
     normals: wp.array2d(dtype=wp.vec3),
     body_sides: wp.array3d(dtype=wp.float32),
-    body: int,
+    spans: ReceiverSpans,
+    body_of_span: SpanValues,
     centers: wp.array2d(dtype=wp.vec3),
     radii: wp.array2d(dtype=wp.float32),
     blocker_indices: wp.array(dtype=wp.int32),
@@ -209,6 +220,7 @@ def _find_fronts(
             else:
                 side_of_body = float(1.0)
                 if body_sides:
+                    body = value_of_span(body_of_span, span_of_receiver(spans, receiver))
                     side_of_body = body_sides[instance_in(batch, body_sides.shape[0]), body, plane]
                 front = _front_by_height(height, margin, side_of_body, wp.dot(normal, plane_normal))
             relative_height = height / (2.0 * _LIFT_IN_MARGINS * margin)
@@ -235,7 +247,7 @@ def find_fronts(
     frames: wp.array,
     planes: PlaneBlockers,
     *,
-    body: int = 0,
+    spans: Sequence[Span] = (),
     skip: int | None = None,
 ) -> PlaneFronts:
     """Weight of each plane's front for each receiver, and receivers lifted off planes in which they lie.
@@ -247,7 +259,7 @@ def find_fronts(
         spheres: The blockers nearest to patch samples; None where no receiver is one.
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`. Any batch
             may be 1.
-        body: Number of the receivers' body.
+        spans: Of the receivers, which know their body; () for those of body 0.
         skip: Number of the plane that the receivers are part of, off which none is lifted; None for none.
     Differentiable: points, normals, body_sides, centers and radii of spheres, frames.
     """
@@ -260,6 +272,8 @@ def find_fronts(
     shape = common_batch({**arguments, "body_sides": body_sides}), points.shape[1]
     front_weights = empty((*shape, planes.count), dtype=wp.float32, device=points.device)
     lifted_points = empty(shape, dtype=wp.vec3, device=points.device)
-    inputs = [points, normals, body_sides, body, centers, radii, blocker_indices, frames, planes.grids]
+    of_spans = receiver_spans(spans, points.shape[1], 1, points.device)
+    bodies = span_values([span.body for span in spans] or [0], points.device)
+    inputs = [points, normals, body_sides, of_spans, bodies, centers, radii, blocker_indices, frames, planes.grids]
     launch(_find_fronts, shape, inputs=[*inputs, -1 if skip is None else skip], outputs=[front_weights, lifted_points])
     return PlaneFronts(front_weights, lifted_points)

@@ -18,10 +18,11 @@ from warpshadow.device.parallel import run_dimensions, run_length, split_launch
 from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.sides import split_side, split_sides
+from warpshadow.stages.receivers.body_spans import Span, spans_of
 from warpshadow.stages.receivers.quadtree import Quadtree
 from warpshadow.stages.receivers.receiver_footprints import FootprintInputs, find_pixel_area
 from warpshadow.stages.receivers.receiver_means import VisibleSurface
-from warpshadow.stages.receivers.sample_receivers import Span, find_sample_receivers, spans_of
+from warpshadow.stages.receivers.sample_receivers import find_sample_receivers
 from warpshadow.stages.silhouettes.find import Silhouettes
 
 _MARK_COST, _GATHER_COST = 5.0, 40.0

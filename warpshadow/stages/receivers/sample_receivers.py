@@ -22,6 +22,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, filled, from_numpy, reshaped
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.receivers.body_spans import Span
 from warpshadow.stages.receivers.quadtree import Quadtree, sample_at
 from warpshadow.stages.receivers.receiver_means import VisibleSurface, mean_fragments, sample_of_pixel
 
@@ -36,21 +37,6 @@ MAX_SHARED_SAMPLES = 2
 wants edges and bumps within pixels resolved."""
 
 _SHARING_COST, _SAMPLE_COST = 12.0, 3.5  # nanoseconds of a sample, to find whose receiver it shares and to get it
-
-
-class Span(NamedTuple):
-    """Consecutive receivers of one body; body −1 has all receivers that share their blockers."""
-
-    body: int
-    first: int
-    end: int
-
-
-def spans_of(bodies: np.ndarray) -> tuple[Span, ...]:
-    """Split a list of bodies into spans of the same body."""
-    changes = np.flatnonzero(np.diff(bodies)) + 1
-    bounds = [0, *changes.tolist(), len(bodies)] if len(bodies) else []
-    return tuple(Span(int(bodies[first]), first, end) for first, end in itertools.pairwise(bounds))
 
 
 class SampleReceivers(NamedTuple):

@@ -10,6 +10,7 @@ a lookup is one vector, where it would be bytes from all over memory. A single l
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -18,7 +19,6 @@ from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.lanes import (
     Chunk,
     as_chunks,
-    block_count,
     lane_count,
     lane_type,
     make_lane_functions,
@@ -29,7 +29,17 @@ from warpshadow.device.launch import launch, launch_with_adjoint
 from warpshadow.device.memory import as_items, empty, require_gradient
 from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.device.warp_sums import sum_over_warp
-from warpshadow.stages.self_visibility.lookup import ResamplingKernels, ResamplingWeights
+from warpshadow.stages.receivers.body_spans import (
+    ReceiverBlock,
+    ReceiverSpans,
+    Span,
+    SpanValues,
+    make_find_span,
+    receiver_spans,
+    span_values,
+    value_of_span,
+)
+from warpshadow.stages.self_visibility.lookup import BodyKernels, ResamplingKernels, ResamplingWeights
 from warpshadow.stages.self_visibility.probes import ProbeWeights
 from warpshadow.stages.self_visibility.trace import VisibilityRows
 
@@ -39,19 +49,28 @@ _CELLS_PER_WORD = 4  # coarse cells of a word of 32 bits
 
 
 @wp.struct
+class BodyTable:
+    """Self-visibility of a body's probes."""
+
+    bits: wp.array2d(dtype=wp.uint32)
+    words: wp.array2d(dtype=wp.uint32)
+
+
+@wp.struct
 class GatherInputs:
     """Inputs of gathering, and of its adjoint."""
 
     normals: wp.array2d(dtype=wp.vec3)
+    spans: ReceiverSpans
+    table_of_span: SpanValues  # the number of its body among those of the tables
     rows: wp.array2d(dtype=wp.vec3i)
     probe_weights: wp.array2d(dtype=wp.vec3)
     directions: wp.array(dtype=wp.vec3)
-    uses_rays: wp.array(dtype=wp.int32)
-    counts: wp.array2d(dtype=wp.int32)
-    indices: wp.array3d(dtype=wp.int32)
-    weights: wp.array3d(dtype=wp.float32)
-    bits: wp.array2d(dtype=wp.uint32)
-    words: wp.array2d(dtype=wp.uint32)
+    counts: wp.array3d(dtype=wp.int32)
+    indices: wp.array4d(dtype=wp.int32)
+    weights: wp.array4d(dtype=wp.float32)
+    kernels: wp.array(dtype=ResamplingKernels)  # [body]
+    tables: wp.array(dtype=BodyTable)  # [body]
 
 
 @functools.cache
@@ -83,16 +102,16 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
     Lane, ProbeLanes = lane_type(lanes), _probes_type(lanes)
     Rows = wp.types.vector(length=lanes, dtype=wp.int32)
     fn = make_lane_functions(lanes)
-    find_block, load = fn.find_block, fn.load
+    load, find_span = fn.load, make_find_span(lanes)
 
     @wp.func
-    def load_probes(inputs: GatherInputs, batch: int, block: int):
-        rows = inputs.rows[instance_in(batch, inputs.rows.shape[0])]
-        weights = inputs.probe_weights[instance_in(batch, inputs.probe_weights.shape[0])]
+    def load_probes(inputs: GatherInputs, block: ReceiverBlock):
+        rows = inputs.rows[instance_in(block.batch, inputs.rows.shape[0])]
+        weights = inputs.probe_weights[instance_in(block.batch, inputs.probe_weights.shape[0])]
         probes = ProbeLanes()
         probes.corner_count = 1
         for lane in range(lanes):
-            receiver = wp.min(block * lanes + lane, rows.shape[0] - 1)
+            receiver = wp.min(block.first + block.number * lanes + lane, block.end - 1)
             row = rows[receiver]
             weight = wp.vec3(1.0, 0.0, 0.0)
             if row[0] != row[1] or row[0] != row[2]:
@@ -124,31 +143,33 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
         ...
 
     @wp.func
-    def load_visibility(rows: Rows, uses_rays: int, index: int, inputs: GatherInputs):
+    def load_visibility(rows: Rows, uses_rays: int, index: int, table: BodyTable):
         """S of a ray or coarse cell in a row of each receiver, from 0 to 1."""
         visibility = Lane()
         for lane in range(lanes):
             if uses_rays == 1:
                 visibility[lane] = float(
-                    int((inputs.bits[rows[lane], index >> 5] >> wp.uint32(index & 31)) & wp.uint32(1))
+                    int((table.bits[rows[lane], index >> 5] >> wp.uint32(index & 31)) & wp.uint32(1))
                 )
             else:
-                word = inputs.words[rows[lane], index // _CELLS_PER_WORD]
+                word = table.words[rows[lane], index // _CELLS_PER_WORD]
                 byte = (word >> wp.uint32(8 * (index % _CELLS_PER_WORD))) & wp.uint32(255)
                 visibility[lane] = float(int(byte)) * (1.0 / 255.0)
         return visibility
 
     @wp.func
-    def load_block(inputs: GatherInputs, row: int, receiver_count: int, cell_visibility: wp.array(dtype=Lane)):
+    def load_block(inputs: GatherInputs, row: int, cell_visibility: wp.array(dtype=Lane)):
         """Load a block of receivers, and S of all coarse cells where there are several."""
-        batch, block = find_block(row, receiver_count)
-        probes = load_probes(inputs, batch, block)
+        block = find_span(inputs.spans, row)
+        probes = load_probes(inputs, block)
+        table = inputs.tables[value_of_span(inputs.table_of_span, block.span)]
         if wp.static(lanes > 1):
             for cell in range(cell_visibility.shape[0]):
                 cell_visibility[cell] = Lane(0.0)
             for corner in range(probes.corner_count):
-                add_cell_visibility(probes.rows[corner], probes.weights[corner], inputs.words, cell_visibility)
-        return batch, block, load(inputs.normals[instance_in(batch, inputs.normals.shape[0])], block), probes
+                add_cell_visibility(probes.rows[corner], probes.weights[corner], table.words, cell_visibility)
+        normals = inputs.normals[instance_in(block.batch, inputs.normals.shape[0])][block.first : block.end]
+        return block, load(normals, block.number), probes, table
 
     return _ProbeFunctions(load_block, add_cell_visibility, load_visibility)
 
@@ -174,31 +195,34 @@ def _make_gather(lanes: int) -> wp.Kernel:
         item = first_row + wp.tid()
         cell_visibility = scratch[scratch_slot(worker, item), 0]
         columns = scratch[scratch_slot(worker, item), 1]
-        batch, block, normal, probes = load_block(inputs, item, transmittance_self.shape[1], cell_visibility)
-        weight_batch = instance_in(batch, inputs.counts.shape[0])
+        block, normal, probes, table = load_block(inputs, item, cell_visibility)
+        weight_batch = instance_in(block.batch, inputs.counts.shape[0])
+        body = value_of_span(inputs.table_of_span, block.span)
+        kernels = inputs.kernels[body]
+        rows = transmittance_self[block.batch][block.first : block.end]
         for q in range(inputs.directions.shape[0]):
             transmittance = Lane(0.0)
             cosine = dot_direction(inputs.directions[q], normal)
             if is_any_above(cosine, 0.0):
-                indices = inputs.indices[weight_batch, q]
-                weights = inputs.weights[weight_batch, q]
-                uses_rays = inputs.uses_rays[q]
+                indices = inputs.indices[weight_batch, body, q]
+                weights = inputs.weights[weight_batch, body, q]
+                uses_rays = kernels.uses_rays[q]
                 if wp.static(lanes == 1) or uses_rays == 1:
-                    for k in range(inputs.counts[weight_batch, q]):
+                    for k in range(inputs.counts[weight_batch, body, q]):
                         for corner in range(probes.corner_count):
-                            visibility = load_visibility(probes.rows[corner], uses_rays, indices[k], inputs)
+                            visibility = load_visibility(probes.rows[corner], uses_rays, indices[k], table)
                             transmittance += weights[k] * wp.cw_mul(probes.weights[corner], visibility)
                 else:
-                    for k in range(inputs.counts[weight_batch, q]):
+                    for k in range(inputs.counts[weight_batch, body, q]):
                         transmittance += weights[k] * cell_visibility[indices[k]]
             for lane in range(lanes):
                 transmittance[lane] = wp.where(cosine[lane] > 0.0, transmittance[lane], 1.0)
             if wp.static(lanes == 1):
-                transmittance_self[batch, block, q] = transmittance[0]
+                rows[block.number, q] = transmittance[0]
             else:
                 columns[q] = transmittance
         if wp.static(lanes > 1):
-            store_columns(columns, 0, transmittance_self[batch], 0, inputs.directions.shape[0], block)
+            store_columns(columns, 0, rows, 0, inputs.directions.shape[0], block.number)
 
     return gather
 
@@ -222,7 +246,7 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         # out
         adj_probe_weights: wp.array2d(dtype=wp.vec3),
         # sums
-        adj_resampling_weights: wp.array3d(dtype=wp.float32),
+        adj_resampling_weights: wp.array4d(dtype=wp.float32),
     ):
         """A thread owns a block of receivers:  w̄_qk += T̄_q Σ_j b_j S_jqk,  b̄_j += Σ_qk T̄_q w_qk S_jqk.
 
@@ -231,29 +255,34 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         item = first_row + wp.tid()
         cell_visibility = scratch[scratch_slot(worker, item), 0]
         adj_cell_visibility = scratch[scratch_slot(worker, item), 1]
-        batch, block, normal, probes = load_block(inputs, item, adj_transmittance.shape[1], cell_visibility)
-        weight_batch = instance_in(batch, inputs.counts.shape[0])
+        block, normal, probes, table = load_block(inputs, item, cell_visibility)
+        weight_batch = instance_in(block.batch, inputs.counts.shape[0])
+        body = value_of_span(inputs.table_of_span, block.span)
+        kernels = inputs.kernels[body]
+        first_receiver = block.first + block.number * lanes
         if wp.static(lanes > 1):
             for cell in range(cell_visibility.shape[0]):
                 adj_cell_visibility[cell] = Lane(0.0)
-        receiver_count = wp.min(lanes, adj_transmittance.shape[1] - block * lanes)
+        receiver_count = wp.min(lanes, block.end - first_receiver)
         adj_corner_weights = Weights()
         for q in range(inputs.directions.shape[0]):
             cosine = dot_direction(inputs.directions[q], normal)
             if is_any_above(cosine, 0.0):
                 adj = Lane()
                 for lane in range(receiver_count):
-                    adj[lane] = wp.where(cosine[lane] > 0.0, adj_transmittance[batch, block * lanes + lane, q], 0.0)
-                indices = inputs.indices[weight_batch, q]
-                weights = inputs.weights[weight_batch, q]
-                uses_rays = inputs.uses_rays[q]
+                    adj[lane] = wp.where(
+                        cosine[lane] > 0.0, adj_transmittance[block.batch, first_receiver + lane, q], 0.0
+                    )
+                indices = inputs.indices[weight_batch, body, q]
+                weights = inputs.weights[weight_batch, body, q]
+                uses_rays = kernels.uses_rays[q]
                 if wp.static(lanes == 1) or uses_rays == 1:
-                    for k in range(inputs.counts[weight_batch, q]):
+                    for k in range(inputs.counts[weight_batch, body, q]):
                         adj_weight = float(0.0)
                         for corner in range(3):
                             if corner < probes.corner_count:
                                 adj_visibility = wp.cw_mul(
-                                    adj, load_visibility(probes.rows[corner], uses_rays, indices[k], inputs)
+                                    adj, load_visibility(probes.rows[corner], uses_rays, indices[k], table)
                                 )
                                 adj_corner_weights[corner] += weights[k] * adj_visibility
                                 adj_weight += total(wp.cw_mul(probes.weights[corner], adj_visibility))
@@ -261,46 +290,70 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                             if wp.static(lanes == 1):
                                 adj_weight = sum_over_warp(
                                     adj_weight,
-                                    (weight_batch * inputs.directions.shape[0] + q) * adj_resampling_weights.shape[2]
+                                    ((weight_batch * inputs.counts.shape[1] + body) * inputs.directions.shape[0] + q)
+                                    * adj_resampling_weights.shape[3]
                                     + k,
                                 )
                             if adj_weight != 0.0:
-                                wp.atomic_add(adj_resampling_weights, weight_batch, q, k, adj_weight)
+                                wp.atomic_add(adj_resampling_weights, weight_batch, body, q, k, adj_weight)
                 else:
-                    for k in range(inputs.counts[weight_batch, q]):
+                    for k in range(inputs.counts[weight_batch, body, q]):
                         adj_cell_visibility[indices[k]] = adj_cell_visibility[indices[k]] + weights[k] * adj
                         if adj_resampling_weights:
                             adj_weight_sum = total(wp.cw_mul(adj, cell_visibility[indices[k]]))
-                            wp.atomic_add(adj_resampling_weights, weight_batch, q, k, adj_weight_sum)
+                            wp.atomic_add(adj_resampling_weights, weight_batch, body, q, k, adj_weight_sum)
         if adj_probe_weights:
             for corner in range(3):
                 adj_corner = adj_corner_weights[corner]
                 if wp.static(lanes > 1):
                     for cell in range(cell_visibility.shape[0]):
                         cell_visibility[cell] = Lane(0.0)
-                    add_cell_visibility(probes.rows[corner], Lane(1.0), inputs.words, cell_visibility)
+                    add_cell_visibility(probes.rows[corner], Lane(1.0), table.words, cell_visibility)
                     for cell in range(cell_visibility.shape[0]):
                         adj_corner += wp.cw_mul(adj_cell_visibility[cell], cell_visibility[cell])
                 for lane in range(receiver_count):
-                    receiver = block * lanes + lane
+                    receiver = first_receiver + lane
                     adj_corner_vector = wp.vec3()
                     adj_corner_vector[corner] = adj_corner[lane]
-                    adj_probe_weights[batch, receiver] = adj_probe_weights[batch, receiver] + adj_corner_vector
+                    adj_probe_weights[block.batch, receiver] = (
+                        adj_probe_weights[block.batch, receiver] + adj_corner_vector
+                    )
 
     return gather_adjoint
+
+
+class BodyTables(NamedTuple):
+    """Self-visibility of the probes of some bodies."""
+
+    rows: tuple[VisibilityRows, ...]  # of each body
+    table: wp.array  # of :class:`BodyTable`, [body]
+
+    @classmethod
+    def of_rows(cls, rows: Sequence[VisibilityRows]) -> "BodyTables":
+        """Tables of bodies, given the rows of each."""
+        tables = []
+        for rows_of_body in rows:
+            table = BodyTable()
+            table.bits, table.words = rows_of_body.bits, as_items(rows_of_body.cells, wp.uint32, _CELLS_PER_WORD)
+            tables.append(table)
+        return cls(tuple(rows), wp.array(tables, dtype=BodyTable, device=rows[0].bits.device))
 
 
 def gather_self_transmittance(
     normals: wp.array,
     probe_weights: ProbeWeights,
     resampling_weights: ResamplingWeights,
-    kernels: ResamplingKernels,
-    rows: VisibilityRows,
+    kernels: BodyKernels,
+    tables: BodyTables,
+    spans: Sequence[Span] = (),
+    table_of_span: Sequence[int] = (0,),
 ) -> wp.array:
-    """Gather the self-visibility of a body's receivers.
+    """Gather the self-visibility of receivers of some bodies.
 
     Args:
         normals: Unit normals of the receivers, vec3 of shape [batch, receiver].
+        spans: Of the receivers, by body; () for one of all.
+        table_of_span: The number of each span's body among those of the tables.
     Returns:
         Transmittance T_self in [0, 1], float32 of shape [batch, receiver, direction].
     Differentiable: weights of probe_weights and of resampling_weights. Not: normals (they only cut off directions
@@ -309,26 +362,27 @@ def gather_self_transmittance(
     batch_count = common_batch(
         {"normals": normals, "probe_weights": probe_weights.rows, "resampling_weights": resampling_weights.counts}
     )
-    direction_count = kernels.directions.size
+    directions, device = kernels.kernels[0].directions, normals.device
+    direction_count = directions.size
     shape = batch_count, normals.shape[1], direction_count
     if probe_weights.weights.requires_grad:
         # each instance has a gradient of its own
         probe_weights = ProbeWeights(probe_weights.rows, expand(probe_weights.weights, batch_count))
-    lanes = lane_count(normals.device)
-    words = as_items(rows.cells, wp.uint32, _CELLS_PER_WORD)
+    lanes = lane_count(device)
     inputs = GatherInputs()
     inputs.normals, inputs.rows, inputs.probe_weights = normals, *probe_weights
-    inputs.directions, inputs.uses_rays = kernels.directions, kernels.uses_rays
+    inputs.spans = receiver_spans(spans, shape[1], lanes, device)
+    inputs.table_of_span = span_values(table_of_span, device)
+    inputs.directions, inputs.kernels, inputs.tables = directions, kernels.table, tables.table
     inputs.counts, inputs.indices, inputs.weights = resampling_weights
-    inputs.bits, inputs.words = rows.bits, words
     lookup_count = _MEAN_LOOKUPS * direction_count * lanes
-    cell_count = max(_CELLS_PER_WORD * words.shape[1], direction_count) if lanes > 1 else 1
+    cell_count = max(direction_count, *(rows.cells.shape[1] for rows in tables.rows)) if lanes > 1 else 1
     return launch_with_adjoint(
         _make_gather(lanes),
         lambda: _make_gather_adjoint(lanes),
-        batch_count * block_count(shape[1], lanes),
+        batch_count * inputs.spans.block_count,
         inputs=[inputs],
-        result=empty(shape, dtype=wp.float32, device=normals.device),
+        result=empty(shape, dtype=wp.float32, device=device),
         variables=[probe_weights.weights],
         shared=[resampling_weights.weights],
         scratch=[Scratch((2, cell_count), lane_type(lanes))],

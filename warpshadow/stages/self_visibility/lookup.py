@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from warpshadow.device.constants import cached_by_values, constant
+from warpshadow.device.constants import cached_by_values, constant, note_use
 from warpshadow.device.launch import differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
@@ -84,11 +84,39 @@ def find_resampling_kernels(
 
 
 class ResamplingWeights(NamedTuple):
-    """Resampling weights of each cell of directions under a rotation."""
+    """Resampling weights of each cell of directions under the rotations of some bodies."""
 
-    counts: wp.array  # number of lookups, int32 of shape [batch, direction]
-    indices: wp.array  # rays or coarse cells, int32 of shape [batch, direction, lookup]
-    weights: wp.array  # their weights, float32 of shape [batch, direction, lookup]; 0 after the last
+    counts: wp.array  # number of lookups, int32 of shape [batch, body, direction]
+    indices: wp.array  # rays or coarse cells, int32 of shape [batch, body, direction, lookup]
+    weights: wp.array  # their weights, float32 of shape [batch, body, direction, lookup]; 0 after the last
+
+
+class BodyKernels(NamedTuple):
+    """Resampling kernels of the cells of several bodies, which have their own numbers of rays."""
+
+    kernels: tuple[ResamplingKernels, ...]  # of each body
+    bodies: wp.array  # numbers of the bodies, int32
+    table: wp.array  # of the kernels, [body]
+
+
+@cached_by_values
+def find_body_kernels(
+    bodies: tuple[int, ...],
+    ray_counts: tuple[int, ...],
+    directions: np.ndarray,
+    half_angles: np.ndarray | None,
+    device: wp.Device,
+) -> BodyKernels:
+    """Find the resampling kernels of bodies.
+
+    Args:
+        bodies, ray_counts: Their numbers, and the rays of a probe of each.
+        directions, half_angles: As for :func:`find_resampling_kernels`.
+    """
+    kernels = tuple(find_resampling_kernels(directions, half_angles, count, device) for count in ray_counts)
+    table = wp.array(list(kernels), dtype=ResamplingKernels, device=device)
+    note_use(table)
+    return BodyKernels(kernels, constant(np.array(bodies), wp.int32, device), table)
 
 
 @wp.func
@@ -113,16 +141,20 @@ def _find_weights(
     worker: int,
     # in
     rotations: wp.array2d(dtype=wp.mat33),
-    body: int,
-    kernels: ResamplingKernels,
+    bodies: wp.array(dtype=wp.int32),
+    table: wp.array(dtype=ResamplingKernels),
     # out
-    counts: wp.array2d(dtype=wp.int32),
-    indices: wp.array3d(dtype=wp.int32),
-    weights: wp.array3d(dtype=wp.float32),
+    all_counts: wp.array3d(dtype=wp.int32),
+    all_indices: wp.array4d(dtype=wp.int32),
+    all_weights: wp.array4d(dtype=wp.float32),
 ):
-    """A thread owns a cell of directions of an instance."""
-    batch, direction = split_row(first_row + wp.tid(), kernels.directions.shape[0])
-    _rotated_direction, kernel_axis, cos_radius, candidates = _load_kernel(kernels, rotations[batch, body], direction)
+    """A thread owns a cell of directions of a body of an instance."""
+    item, direction = split_row(first_row + wp.tid(), all_counts.shape[2])
+    batch, body = split_row(item, all_counts.shape[1])
+    kernels = table[body]
+    counts, indices, weights = all_counts[batch, body], all_indices[batch, body], all_weights[batch, body]
+    rotation = rotations[batch, bodies[body]]
+    _rotated_direction, kernel_axis, cos_radius, candidates = _load_kernel(kernels, rotation, direction)
     count = int(0)
     weight_sum = float(0.0)
     width = candidates.shape[0] // kernels.cells.shape[0]
@@ -130,77 +162,76 @@ def _find_weights(
         if wp.dot(kernels.cells[cell], kernel_axis) > kernels.cos_outer_radii[direction]:
             for candidate in range(width * cell, width * cell + width):
                 profile = _profile(wp.dot(candidates[candidate], kernel_axis), cos_radius)
-                if profile > 0.0 and count < weights.shape[2]:
-                    indices[batch, direction, count] = candidate
-                    weights[batch, direction, count] = profile * profile
+                if profile > 0.0 and count < weights.shape[1]:
+                    indices[direction, count] = candidate
+                    weights[direction, count] = profile * profile
                     weight_sum += profile * profile
                     count += 1
-    counts[batch, direction] = count
-    for k in range(weights.shape[2]):
+    counts[direction] = count
+    for k in range(weights.shape[1]):
         if k < count:
-            weights[batch, direction, k] = weights[batch, direction, k] / weight_sum
+            weights[direction, k] = weights[direction, k] / weight_sum
         else:
-            indices[batch, direction, k] = 0
-            weights[batch, direction, k] = 0.0
+            indices[direction, k] = 0
+            weights[direction, k] = 0.0
 
 
 @wp.kernel(enable_backward=False)
 def _find_weights_adjoint(
     # in
     rotations: wp.array2d(dtype=wp.mat33),
-    body: int,
-    kernels: ResamplingKernels,
-    counts: wp.array2d(dtype=wp.int32),
-    indices: wp.array3d(dtype=wp.int32),
-    weights: wp.array3d(dtype=wp.float32),
-    adj_weights: wp.array3d(dtype=wp.float32),
+    bodies: wp.array(dtype=wp.int32),
+    table: wp.array(dtype=ResamplingKernels),
+    all_counts: wp.array3d(dtype=wp.int32),
+    all_indices: wp.array4d(dtype=wp.int32),
+    all_weights: wp.array4d(dtype=wp.float32),
+    all_adj_weights: wp.array4d(dtype=wp.float32),
     # out
     adj_rotations: wp.array2d(dtype=wp.mat33),
 ):
-    """A thread owns a cell of directions of an instance.
+    """A thread owns a cell of directions of a body of an instance.
 
     With v = Rᵀω and S = Σ x²:  x̄_k = 2 x_k (w̄_k − Σ w̄ w) / S,  d̄ = Σ x̄_k c_k / (1 − cos h),
     v̄ = (d̄ − d d·d̄) / |v|,  R̄ += ω v̄ᵀ
     """
-    batch, direction = wp.tid()
-    rotated_direction, kernel_axis, cos_radius, candidates = _load_kernel(kernels, rotations[batch, body], direction)
+    batch, body, direction = wp.tid()
+    kernels = table[body]
+    count, indices = all_counts[batch, body, direction], all_indices[batch, body, direction]
+    weights, adj_weights = all_weights[batch, body, direction], all_adj_weights[batch, body, direction]
+    rotation = rotations[batch, bodies[body]]
+    rotated_direction, kernel_axis, cos_radius, candidates = _load_kernel(kernels, rotation, direction)
     weight_sum = float(0.0)
     adj_weight_mean = float(0.0)
-    for k in range(counts[batch, direction]):
-        profile = _profile(wp.dot(candidates[indices[batch, direction, k]], kernel_axis), cos_radius)
+    for k in range(count):
+        profile = _profile(wp.dot(candidates[indices[k]], kernel_axis), cos_radius)
         weight_sum += profile * profile
-        adj_weight_mean += adj_weights[batch, direction, k] * weights[batch, direction, k]
+        adj_weight_mean += adj_weights[k] * weights[k]
     adj_axis = wp.vec3()
-    for k in range(counts[batch, direction]):
-        candidate = candidates[indices[batch, direction, k]]
+    for k in range(count):
+        candidate = candidates[indices[k]]
         profile = _profile(wp.dot(candidate, kernel_axis), cos_radius)
-        adj_axis += (
-            2.0
-            * profile
-            * (adj_weights[batch, direction, k] - adj_weight_mean)
-            / weight_sum
-            / (1.0 - cos_radius)
-            * candidate
-        )
+        adj_axis += 2.0 * profile * (adj_weights[k] - adj_weight_mean) / weight_sum / (1.0 - cos_radius) * candidate
     adj_rotated = (adj_axis - wp.dot(adj_axis, kernel_axis) * kernel_axis) / wp.length(rotated_direction)
-    wp.atomic_add(adj_rotations, batch, body, wp.outer(kernels.directions[direction], adj_rotated))
+    wp.atomic_add(adj_rotations, batch, bodies[body], wp.outer(kernels.directions[direction], adj_rotated))
 
 
-def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingKernels) -> ResamplingWeights:
+def find_resampling_weights(rotations: wp.array, body_kernels: BodyKernels) -> ResamplingWeights:
     """Find the resampling weights of cells of directions.
 
     Args:
-        rotations: R of each body, mat33 of shape [batch, body].
+        rotations: R of all bodies of the scene, mat33 of shape [batch, body].
+        body_kernels: Of some of them, whose weights these are.
     Differentiable: rotations.
     """
-    shape = len(rotations), kernels.directions.size
-    device = rotations.device
+    kernels, bodies, table = body_kernels
+    shape, device = (len(rotations), len(kernels), kernels[0].directions.size), rotations.device
+    lookups = *shape, max(of_body.max_lookups for of_body in kernels)
     counts = empty(shape, dtype=wp.int32, device=device)
-    indices = empty((*shape, kernels.max_lookups), dtype=wp.int32, device=device)
-    inputs = [rotations, body, kernels]
+    indices = empty(lookups, dtype=wp.int32, device=device)
+    inputs = [rotations, bodies, table]
     weights = differentiable(
         lambda weights: launch(
-            _find_weights, shape[0] * shape[1], inputs=inputs, outputs=[counts, indices, weights], cost=_CELL_COST
+            _find_weights, counts.size, inputs=inputs, outputs=[counts, indices, weights], cost=_CELL_COST
         ),
         lambda adj_weights: launch(
             _find_weights_adjoint,
@@ -208,7 +239,7 @@ def find_resampling_weights(rotations: wp.array, body: int, kernels: ResamplingK
             inputs=[*inputs, counts, indices, weights, adj_weights],
             outputs=[rotations.grad],
         ),
-        result=empty((*shape, kernels.max_lookups), dtype=wp.float32, device=device),
+        result=empty(lookups, dtype=wp.float32, device=device),
         variables=[rotations],
     )
     return ResamplingWeights(counts, indices, weights)

@@ -6,8 +6,8 @@ nor cut by the face beside it, so that faces agree (Rivara 1984). The visibility
 corners of its piece. The first probes are the vertices; the backs of all probes of an open body follow.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -17,6 +17,15 @@ from warpshadow.device.memory import empty
 from warpshadow.maths.inset import inset_vertices
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.sides import split_side
+from warpshadow.stages.receivers.body_spans import (
+    ReceiverSpans,
+    Span,
+    SpanValues,
+    receiver_spans,
+    span_of_receiver,
+    span_values,
+    value_of_span,
+)
 
 _EVEN_FACES = 10_000
 """Edges are judged by those of an even cut of the surface into so many faces (507 vertices alone lose 3.5%)."""
@@ -167,21 +176,33 @@ def _cut_faces(
         pieces = np.concatenate([pieces, new_pieces])
 
 
+@wp.struct
+class ProbeTable:
+    """By which receivers of a body find their probes."""
+
+    first_vertex: int  # of the body's vertices among all
+    first_face: int  # likewise of its faces
+    probe_count: int  # number of its probes; their backs follow
+    pieces: wp.array(dtype=wp.vec4i)  # as in VisibilityProbes
+
+
 @wp.kernel(enable_backward=False)
 def _find_vertex_weights(
     # in
     vertices: wp.array(dtype=wp.int32),
     vertex_count: int,
-    first_vertex: int,
-    probe_count: int,
+    spans: ReceiverSpans,
+    tables: wp.array(dtype=ProbeTable),
+    table_of_span: SpanValues,
     # out
     rows: wp.array2d(dtype=wp.vec3i),
     weights: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver at a vertex."""
     receiver = wp.tid()
+    table = tables[value_of_span(table_of_span, span_of_receiver(spans, receiver))]
     vertex, is_back = split_side(vertices[receiver], vertex_count)
-    row = vertex - first_vertex + wp.where(is_back, probe_count, 0)
+    row = vertex - table.first_vertex + wp.where(is_back, table.probe_count, 0)
     rows[0, receiver] = wp.vec3i(row, row, row)
     weights[0, receiver] = wp.vec3(1.0, 0.0, 0.0)
 
@@ -233,53 +254,77 @@ def _find_sample_weights(
     sides: wp.array2d(dtype=wp.int32),
     barycentrics: wp.array2d(dtype=wp.vec3),
     face_count: int,
-    first_face: int,
-    probe_count: int,
-    pieces: wp.array(dtype=wp.vec4i),
+    spans: ReceiverSpans,
+    tables: wp.array(dtype=ProbeTable),
+    table_of_span: SpanValues,
     # out
     rows: wp.array2d(dtype=wp.vec3i),
     weights: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver at a fragment, −1 for none."""
     batch, receiver = wp.tid()
-    face, is_back = split_side(wp.max(sides[batch, receiver], first_face), face_count)
-    corners, piece_weights = _find_piece(pieces, face - first_face, barycentrics[batch, receiver])
-    back_offset = wp.where(is_back, probe_count, 0)
+    table = tables[value_of_span(table_of_span, span_of_receiver(spans, receiver))]
+    face, is_back = split_side(wp.max(sides[batch, receiver], table.first_face), face_count)
+    corners, piece_weights = _find_piece(table.pieces, face - table.first_face, barycentrics[batch, receiver])
+    back_offset = wp.where(is_back, table.probe_count, 0)
     rows[batch, receiver] = corners + wp.vec3i(back_offset, back_offset, back_offset)
     weights[batch, receiver] = piece_weights
 
 
-class ProbeTable(NamedTuple):
-    """Arrays by which receivers of a body find their probes."""
+class ProbeTables(NamedTuple):
+    """By which receivers of some bodies find their probes."""
 
-    first_vertex: int  # of the body's vertices among all, and how many all are
-    vertex_count: int
-    first_face: int  # likewise of its faces
+    tables: tuple[ProbeTable, ...]  # of each body
+    table: wp.array  # the same on the device
+    vertex_count: int  # of all bodies
     face_count: int
-    probe_count: int  # number of its probes; their backs follow
-    pieces: wp.array  # as in VisibilityProbes, vec4i
 
-    def of_vertices(self, vertices: wp.array) -> ProbeWeights:
-        """Weights of vertices and their backs, int32 of shape [receiver], indices among all vertices: batch 1."""
+    @classmethod
+    def of_bodies(
+        cls,
+        probes: Sequence[VisibilityProbes],
+        first_vertices: Sequence[int],
+        first_faces: Sequence[int],
+        vertex_count: int,
+        face_count: int,
+        device: wp.DeviceLike,
+    ) -> "ProbeTables":
+        """Tables of some bodies, given the probes of each, and where its vertices and faces begin among all."""
+        tables = []
+        for of_body, first_vertex, first_face in zip(probes, first_vertices, first_faces, strict=True):
+            table = ProbeTable()
+            table.first_vertex, table.first_face, table.probe_count = first_vertex, first_face, len(of_body.positions)
+            table.pieces = wp.array(of_body.pieces, dtype=wp.vec4i, device=device)
+            tables.append(table)
+        return cls(tuple(tables), wp.array(tables, dtype=ProbeTable, device=device), vertex_count, face_count)
+
+    def of_vertices(
+        self, vertices: wp.array, spans: Sequence[Span] = (), table_of_span: Sequence[int] = (0,)
+    ) -> ProbeWeights:
+        """Weights of vertices and their backs, int32 of shape [receiver], indices among all vertices: batch 1.
+
+        Args:
+            spans: Of the receivers, by body; () for one of all.
+            table_of_span: The number of each span's body among those of the tables.
+        """
         probe_weights = _empty_weights(1, vertices.size, vertices.device)
-        inputs = [vertices, self.vertex_count, self.first_vertex, self.probe_count]
+        inputs = [vertices, self.vertex_count, *self._inputs(vertices.size, spans, table_of_span)]
         launch(_find_vertex_weights, vertices.size, inputs=inputs, outputs=list(probe_weights))
         return probe_weights
 
-    def of_samples(self, fragments: Fragments) -> ProbeWeights:
+    def of_samples(
+        self, fragments: Fragments, spans: Sequence[Span] = (), table_of_span: Sequence[int] = (0,)
+    ) -> ProbeWeights:
         """Weights of fragments: sides and barycentrics, [batch, receiver]. Differentiable: barycentrics."""
-        batch_count, count = fragments.face_ids.shape
-        probe_weights = _empty_weights(batch_count, count, fragments.face_ids.device)
-        inputs = [
-            fragments.face_ids,
-            fragments.barycentrics,
-            self.face_count,
-            self.first_face,
-            self.probe_count,
-            self.pieces,
-        ]
-        launch(_find_sample_weights, fragments.face_ids.shape, inputs=inputs, outputs=list(probe_weights))
+        sides, barycentrics = fragments.face_ids, fragments.barycentrics
+        probe_weights = _empty_weights(len(sides), sides.shape[1], sides.device)
+        inputs = [sides, barycentrics, self.face_count, *self._inputs(sides.shape[1], spans, table_of_span)]
+        launch(_find_sample_weights, sides.shape, inputs=inputs, outputs=list(probe_weights))
         return probe_weights
+
+    def _inputs(self, receiver_count: int, spans: Sequence[Span], table_of_span: Sequence[int]) -> list[Any]:
+        device = self.table.device
+        return [receiver_spans(spans, receiver_count, 1, device), self.table, span_values(table_of_span, device)]
 
 
 def _empty_weights(batch_count: int, count: int, device: wp.Device) -> ProbeWeights:

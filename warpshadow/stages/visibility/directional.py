@@ -19,6 +19,7 @@ an edge narrower than a pixel, as a sun's at the foot of a body, has a huge deri
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, run_dimensions, scratch_slot, split_launch
 from warpshadow.maths.directions import BUNDLE, cell_radius
+from warpshadow.stages.receivers.body_spans import Span
 from warpshadow.stages.visibility.culling import (
     DirectionCells,
     cap_type,
@@ -92,16 +94,16 @@ def _make_load_task(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.F
         scratch: wp.array2d(dtype=Lane),
         reached_bundles: wp.array3d(dtype=wp.int32),
     ):
-        batch, block, receivers = load_receivers(inputs, row)
+        block, receivers = load_receivers(inputs, row)
         if wp.static(has_footprints):  # as the light sees them, on average over its directions
-            footprints = load(inputs.footprints[batch], block)
+            footprints = load(inputs.footprints[block.batch][block.first : block.end], block.number)
             for direction in range(cells.directions.shape[0]):
                 receivers.footprints += wp.abs(dot_direction(cells.directions[direction], footprints))
             receivers.footprints = receivers.footprints / float(cells.directions.shape[0])
         slot = scratch_slot(worker, row * all_stops.shape[1] + span)
         stops = all_stops[row, span]
         task = TransmittanceTask(cells, span * stops.shape[0], stops, reached_bundles[slot], scratch[slot])
-        return batch, block, receivers, task
+        return block, receivers, task
 
     return load_task
 
@@ -179,16 +181,17 @@ def _make_transmit(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.Ke
         """A thread owns a block of receivers and a span of bundles; stops are the spheres where it stopped looking."""
         i, j = wp.tid()
         span, row = split_launch(worker, first_row + i, j)
-        batch, block, receivers, task = load_task(row, span, worker, inputs, cells, all_stops, scratch, reached_bundles)
+        block, receivers, task = load_task(row, span, worker, inputs, cells, all_stops, scratch, reached_bundles)
         for bundle in range(task.stops.shape[0]):
             for cell in range(BUNDLE):
                 task.transmittances[bundle * BUNDLE + cell] = Lane(1.0)
             task.stops[bundle] = 0  # wholly below the horizon: the cosine is zero there
             if is_bundle_above(cells, task.first_bundle + bundle, receivers.normals):
                 task.stops[bundle] = inputs.spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
-        traverse(receivers, batch, inputs.spheres, Gradients(), task)
+        traverse(receivers, block.batch, inputs.spheres, Gradients(), task)
         direction_count = task.stops.shape[0] * BUNDLE
-        store_columns(task.transmittances, 0, transmittance[batch], task.first_bundle * BUNDLE, direction_count, block)
+        rows = transmittance[block.batch][block.first : block.end]
+        store_columns(task.transmittances, 0, rows, task.first_bundle * BUNDLE, direction_count, block.number)
 
     return transmit
 
@@ -248,13 +251,16 @@ def _make_transmit_adjoint(has_horizon: bool, has_footprints: bool, lanes: int) 
         """A thread owns a block of receivers and a span of bundles."""
         i, j = wp.tid()
         span, row = split_launch(worker, first_row + i, j)
-        batch, block, receivers, task = load_task(row, span, worker, inputs, cells, all_stops, scratch, reached_bundles)
+        block, receivers, task = load_task(row, span, worker, inputs, cells, all_stops, scratch, reached_bundles)
         first_direction, count = task.first_bundle * BUNDLE, task.stops.shape[0] * BUNDLE
-        load_columns(transmittance[batch], first_direction, count, block, 0.0, task.transmittances, 0)
-        multiply_by_columns(adj_transmittance[batch], first_direction, count, block, task.transmittances, 0)
-        adj_receivers = traverse(receivers, batch, inputs.spheres, Gradients(adj_centers, adj_radii, adj_extents), task)
+        rows = transmittance[block.batch][block.first : block.end]
+        adj_rows = adj_transmittance[block.batch][block.first : block.end]
+        load_columns(rows, first_direction, count, block.number, 0.0, task.transmittances, 0)
+        multiply_by_columns(adj_rows, first_direction, count, block.number, task.transmittances, 0)
+        gradients = Gradients(adj_centers, adj_radii, adj_extents)
+        adj_receivers = traverse(receivers, block.batch, inputs.spheres, gradients, task)
         if adj_points:
-            add_vectors(adj_receivers.points, block, adj_points[batch])
+            add_vectors(adj_receivers.points, block.number, adj_points[block.batch][block.first : block.end])
 
     return transmit_adjoint
 
@@ -268,7 +274,8 @@ def transmittance(
     *,
     softness: float = SOFTNESS,
     merging: float = MERGING,
-    skip: tuple[int, int] = (0, 0),
+    body_spans: Sequence[Span] = (),
+    skips: Sequence[tuple[int, int]] = (),
     clusters: ClusterTree | None = None,
     footprints: wp.array | None = None,
 ) -> wp.array:
@@ -284,7 +291,8 @@ def transmittance(
         softness: κ, half-width of the falloff in cell radii.
         merging: τ, the half-angle in cell radii under which four spheres that follow each other are seen as one (see
             :mod:`warpshadow.stages.visibility.merging`), where there are 512 or more; 0 for never.
-        skip: Spheres that are left out: the first, and the one after the last.
+        body_spans: Of the receivers, by body; () for one of all.
+        skips: Spheres that each span leaves out: the first, and the one after the last; () for none.
         clusters: Of these spheres, from :func:`.traversal.find_clusters`, where they are found already.
         footprints: Areas f² for which receivers stand, as vectors along the normals of their planes or against them
             [scene units²], vec3 of shape [batch, receiver]: by their size as the directions see it, on average, the
@@ -294,12 +302,13 @@ def transmittance(
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii. (That waits for the device. While a CUDA graph
             is captured, nothing is checked.)
-    Differentiable: points, centers, radii. Not: normals (they only cull), directions, softness, merging, skip,
+    Differentiable: points, centers, radii. Not: normals (they only cull), directions, softness, merging, skips,
     clusters, footprints.
     """
     cells = make_cells(directions, softness, points.device, footprints is not None)
+    arguments = points, normals, centers, radii, cell_radius(len(directions))
     inputs, nodes, lanes, row_count = prepare_traversal(
-        points, normals, centers, radii, cell_radius(len(directions)), merging=merging, skip=skip, clusters=clusters
+        *arguments, merging=merging, body_spans=body_spans, skips=skips, clusters=clusters
     )
     if footprints is not None:
         check.shape("footprints", footprints.shape, points.shape)

@@ -4,6 +4,7 @@ log V(x) ≈ f(x) = Σ_i R(u_i) z(θ_i)                [Lyu et al. 2021, section
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import warp as wp
@@ -15,6 +16,7 @@ from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.maths import sh
 from warpshadow.maths.directions import cell_radius
+from warpshadow.stages.receivers.body_spans import Span
 from warpshadow.stages.sh_kernels import make_add_rotated_zonal, make_rotated_zonal_adjoint, zonal_type
 from warpshadow.stages.visibility.cones import cone_type, make_cone_adjoint
 from warpshadow.stages.visibility.merging import MERGING, Gradients
@@ -124,12 +126,12 @@ def _make_accumulate(order: int, has_horizon: bool, lanes: int) -> wp.Kernel:
     ):
         """A thread owns a block of receivers and sums the log-visibility of all spheres."""
         thread = first_row + wp.tid()
-        batch, block, receivers = load_receivers(inputs, thread)
+        block, receivers = load_receivers(inputs, thread)
         row = scratch[scratch_slot(worker, thread)]
         for i in range(wp.static(order**2)):
             row[i] = Lane(0.0)
-        traverse(receivers, batch, inputs.spheres, Gradients(), LogTask(table, row))
-        store_rows(row, block, log_sh[batch])
+        traverse(receivers, block.batch, inputs.spheres, Gradients(), LogTask(table, row))
+        store_rows(row, block.number, log_sh[block.batch][block.first : block.end])
 
     return accumulate_log_sh
 
@@ -219,15 +221,15 @@ def _make_accumulate_adjoint(order: int, has_horizon: bool, lanes: int) -> wp.Ke
     ):
         """A thread owns a block of receivers."""
         thread = first_row + wp.tid()
-        batch, block, receivers = load_receivers(inputs, thread)
+        block, receivers = load_receivers(inputs, thread)
         row = scratch[scratch_slot(worker, thread)]
-        load_rows(adj_log_sh[batch], block, row)
+        load_rows(adj_log_sh[block.batch][block.first : block.end], block.number, row)
         gradients = Gradients(adj_centers, adj_radii, adj_extents)
-        adj_receivers = traverse(receivers, batch, inputs.spheres, gradients, LogTask(table, row))
+        adj_receivers = traverse(receivers, block.batch, inputs.spheres, gradients, LogTask(table, row))
         if adj_points:
-            add_vectors(adj_receivers.points, block, adj_points[batch])
+            add_vectors(adj_receivers.points, block.number, adj_points[block.batch][block.first : block.end])
         if adj_normals:
-            add_vectors(adj_receivers.normals, block, adj_normals[batch])
+            add_vectors(adj_receivers.normals, block.number, adj_normals[block.batch][block.first : block.end])
 
     return accumulate_log_sh_adjoint
 
@@ -241,7 +243,8 @@ def accumulate(
     order: int = 8,
     log: str = "eigen",
     merging: float = MERGING,
-    skip: tuple[int, int] = (0, 0),
+    body_spans: Sequence[Span] = (),
+    skips: Sequence[tuple[int, int]] = (),
     clusters: ClusterTree | None = None,
 ) -> wp.array:
     """Accumulate the log-visibility of spheres in spherical harmonics.
@@ -258,7 +261,7 @@ def accumulate(
         log: "eigen" (Ren et al. 2006, accurate where spheres overlap) or "cap" (the paper's).
         merging: τ, the half-angle under which four spheres that follow each other are seen as one, where there are 512
             or more, in radii 2/order of a cell for each coefficient; 0 for never.
-        skip, clusters: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
+        body_spans, skips, clusters: As for :func:`warpshadow.stages.visibility.directional.transmittance`.
     Returns:
         Log-visibility, float32 of shape [batch, receiver, order²], index l² + l + m.
     Raises:
@@ -267,8 +270,9 @@ def accumulate(
     """
     sh.check_order(order)
     check.choice("log", log, LOGS)
+    arguments = points, normals, centers, radii, cell_radius(order**2)
     inputs, nodes, lanes, row_count = prepare_traversal(
-        points, normals, centers, radii, cell_radius(order**2), merging=merging, skip=skip, clusters=clusters
+        *arguments, merging=merging, body_spans=body_spans, skips=skips, clusters=clusters
     )
     traits = order, normals is not None, lanes
     return launch_with_adjoint(

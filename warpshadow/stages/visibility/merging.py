@@ -161,21 +161,19 @@ class SphereClusters:
     cluster_bounds: wp.array2d(dtype=wp.vec4)
     run_bounds: wp.array2d(dtype=wp.vec4)
     count: int  # of nodes that are no cluster's
-    skip_begin: int  # these spheres are left out, up to the next
-    skip_end: int
     merging_angle: float
 
 
 @wp.func
-def is_skipped_partly(begin: int, end: int, spheres: SphereClusters):
+def is_skipped_partly(begin: int, end: int, skip: wp.vec2i):
     """Whether any sphere from ``begin`` to ``end`` is skipped."""
-    return wp.max(begin, spheres.skip_begin) < wp.min(end, spheres.skip_end)
+    return wp.max(begin, skip[0]) < wp.min(end, skip[1])
 
 
 @wp.func
-def is_skipped(begin: int, end: int, spheres: SphereClusters):
+def is_skipped(begin: int, end: int, skip: wp.vec2i):
     """Whether all spheres from ``begin`` to ``end`` are skipped."""
-    return begin >= spheres.skip_begin and end <= spheres.skip_end
+    return begin >= skip[0] and end <= skip[1]
 
 
 @wp.struct
@@ -251,18 +249,13 @@ def _make_offset_over_extent(lanes: int) -> wp.Function:
 @functools.cache
 def make_cluster_weight(lanes: int) -> wp.Function:
     """Make the kernel function of the weight that a cluster's sphere has for a block of receivers."""
-    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+    Vectors = vectors_type(lanes)
     find_blend, offset_over_extent = _make_find_blend(lanes), _make_offset_over_extent(lanes)
 
     @wp.func
     def find_cluster_weight(points: Vectors, batch: int, cluster: int, spheres: SphereClusters):
-        cluster_weight = Lane(0.0)
-        if cluster < spheres.extents.shape[1] and not is_skipped_partly(
-            CLUSTER_SIZE * cluster, CLUSTER_SIZE * (cluster + 1), spheres
-        ):
-            relative_offset, _inverse_extent = offset_over_extent(points, batch, cluster, spheres)
-            blend, _slope = find_blend(relative_offset, spheres.merging_angle)
-            cluster_weight = blend
+        relative_offset, _inverse_extent = offset_over_extent(points, batch, cluster, spheres)
+        cluster_weight, _slope = find_blend(relative_offset, spheres.merging_angle)
         return cluster_weight
 
     return find_cluster_weight
@@ -290,20 +283,17 @@ def make_cluster_weight_adjoint(lanes: int) -> wp.Function:
         gradients: Gradients,
     ):
         adj_offset = Vectors()
-        if cluster < spheres.extents.shape[1] and not is_skipped_partly(
-            CLUSTER_SIZE * cluster, CLUSTER_SIZE * (cluster + 1), spheres
-        ):
-            relative_offset, inverse_extent = offset_over_extent(points, batch, cluster, spheres)
-            _cluster_weight, slope = find_blend(relative_offset, spheres.merging_angle)
-            if is_any_above(slope, 0.0):
-                adj_offset = scale((2.0 * inverse_extent) * wp.cw_mul(adj_cluster_weight, slope), relative_offset)
-                add_to_node(adj_offset, Lane(0.0), batch, spheres.count + cluster, gradients)
-                if gradients.extents:
-                    adj_extent = -total(dot(adj_offset, relative_offset))
-                    if wp.static(lanes == 1):
-                        adj_extent = sum_over_warp(adj_extent, batch * gradients.extents.shape[1] + cluster)
-                    if adj_extent != 0.0:
-                        wp.atomic_add(gradients.extents, batch, cluster, adj_extent)
+        relative_offset, inverse_extent = offset_over_extent(points, batch, cluster, spheres)
+        _cluster_weight, slope = find_blend(relative_offset, spheres.merging_angle)
+        if is_any_above(slope, 0.0):
+            adj_offset = scale((2.0 * inverse_extent) * wp.cw_mul(adj_cluster_weight, slope), relative_offset)
+            add_to_node(adj_offset, Lane(0.0), batch, spheres.count + cluster, gradients)
+            if gradients.extents:
+                adj_extent = -total(dot(adj_offset, relative_offset))
+                if wp.static(lanes == 1):
+                    adj_extent = sum_over_warp(adj_extent, batch * gradients.extents.shape[1] + cluster)
+                if adj_extent != 0.0:
+                    wp.atomic_add(gradients.extents, batch, cluster, adj_extent)
         return adj_offset
 
     return adjoint

@@ -6,13 +6,23 @@ spheres are visited. A method supplies culling and a visit; the traversal is gen
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import warp as wp
 
-from warpshadow.device.lanes import block_count, lane_count, lane_type, make_lane_functions, vectors_type
+from warpshadow.device.lanes import lane_count, lane_type, make_lane_functions, vectors_type
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.stages.receivers.body_spans import (
+    ReceiverSpans,
+    Span,
+    SpanValues,
+    make_find_span,
+    receiver_spans,
+    span_values,
+    value_of_span,
+)
 from warpshadow.stages.visibility.cones import TINY_RADIUS, check_spheres, cone_type, make_cone
 from warpshadow.stages.visibility.merging import (
     CLUSTER_SIZE,
@@ -21,6 +31,7 @@ from warpshadow.stages.visibility.merging import (
     Gradients,
     SphereClusters,
     is_skipped,
+    is_skipped_partly,
     make_add_to_node,
     make_cluster_weight,
     make_cluster_weight_adjoint,
@@ -119,6 +130,9 @@ class TraversalInputs:
     points: wp.array2d(dtype=wp.vec3)
     normals: wp.array2d(dtype=wp.vec3)  # empty where there is no horizon
     footprints: wp.array2d(dtype=wp.vec3)  # empty where receivers are points
+    spans: ReceiverSpans
+    skip_begins: SpanValues  # spheres that a span leaves out
+    skip_ends: SpanValues
     spheres: SphereClusters
 
 
@@ -139,7 +153,8 @@ def prepare_traversal(
     cell_radius: float,
     *,
     merging: float,
-    skip: tuple[int, int] = (0, 0),
+    body_spans: Sequence[Span] = (),
+    skips: Sequence[tuple[int, int]] = (),
     clusters: ClusterTree | None = None,
 ) -> SphereTraversal:
     """Put receivers together with spheres and their clusters.
@@ -149,7 +164,8 @@ def prepare_traversal(
         centers, radii: Spheres, [batch, sphere].
         cell_radius: Radius of a cell [rad].
         merging: τ in cell radii, 0 for never.
-        skip: Spheres that are left out: the first, and the one after the last.
+        body_spans: Of the receivers; () for one of all.
+        skips: Spheres that each span leaves out: the first, and the one after the last; () for none.
         clusters: Of these spheres, where they are found already.
     Raises:
         ValueError: for NaN, Inf, numbers beyond 1e18 and negative radii.
@@ -157,17 +173,22 @@ def prepare_traversal(
     """
     check_spheres(points, normals, centers, radii)
     count, lanes = radii.shape[1], lane_count(points.device)
-    if not 0 <= skip[0] <= skip[1] <= count:
-        raise ValueError(f"skip: got {skip!r}, expected a first and an end of {count} spheres")
+    skips = skips or ((0, 0),) * max(len(body_spans), 1)
+    for skip in skips:
+        if not 0 <= skip[0] <= skip[1] <= count:
+            raise ValueError(f"skips: got {skip!r}, expected a first and an end of {count} spheres")
     nodes, *bounds = find_clusters(centers, radii, merging) if clusters is None else clusters
     inputs = TraversalInputs()
     inputs.points, inputs.normals = points, normals
+    inputs.spans = receiver_spans(body_spans, points.shape[1], lanes, points.device)
+    inputs.skip_begins, inputs.skip_ends = (
+        span_values([skip[end] for skip in skips], points.device) for end in range(2)
+    )
     spheres = inputs.spheres  # filled in place: a struct that is assigned is copied field by field
     spheres.centers, spheres.radii, spheres.extents = nodes
     spheres.count, spheres.merging_angle = count, merging * cell_radius
-    spheres.skip_begin, spheres.skip_end = skip
     spheres.cluster_bounds, spheres.run_bounds = bounds
-    return SphereTraversal(inputs, nodes, lanes, points.shape[0] * block_count(points.shape[1], lanes))
+    return SphereTraversal(inputs, nodes, lanes, points.shape[0] * inputs.spans.block_count)
 
 
 @functools.cache
@@ -180,24 +201,26 @@ def receiver_lanes_type(lanes: int) -> Any:
         points: Vectors
         normals: Vectors  # 0 where there is no horizon
         footprints: Lane  # areas as the light sees them, 0 where they are points
+        skip: wp.vec2i  # spheres that they leave out: the first, and the one after the last
 
     return ReceiverLanes
 
 
 @functools.cache
 def make_load_receivers(has_horizon: bool, lanes: int) -> wp.Function:
-    """Make the kernel function that loads receivers without footprints: inputs, row → instance, block, receivers."""
+    """Make the kernel function that loads receivers without footprints: inputs, row → block, receivers."""
     Lane, Vectors, ReceiverLanes = lane_type(lanes), vectors_type(lanes), receiver_lanes_type(lanes)
-    fn = make_lane_functions(lanes)
-    find_block, load = fn.find_block, fn.load
+    load, find_span = make_lane_functions(lanes).load, make_find_span(lanes)
 
     @wp.func(inline=True)
     def load_receivers(inputs: TraversalInputs, row: int):
-        batch, block = find_block(row, inputs.points.shape[1])
+        block = find_span(inputs.spans, row)
         normals = Vectors()
         if wp.static(has_horizon):
-            normals = load(inputs.normals[batch], block)
-        return batch, block, ReceiverLanes(load(inputs.points[batch], block), normals, Lane())
+            normals = load(inputs.normals[block.batch][block.first : block.end], block.number)
+        points = load(inputs.points[block.batch][block.first : block.end], block.number)
+        skip = wp.vec2i(value_of_span(inputs.skip_begins, block.span), value_of_span(inputs.skip_ends, block.span))
+        return block, ReceiverLanes(points, normals, Lane(), skip)
 
     return load_receivers
 
@@ -268,7 +291,7 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
             begin = run * CLUSTERS_PER_RUN
             end = wp.min(begin + CLUSTERS_PER_RUN, spheres.cluster_bounds.shape[1])
             run_count = int(0)
-            if not is_skipped(begin * CLUSTER_SIZE, wp.min(end * CLUSTER_SIZE, spheres.count), spheres):
+            if not is_skipped(begin * CLUSTER_SIZE, wp.min(end * CLUSTER_SIZE, spheres.count), receivers.skip):
                 run_count = cull(
                     receivers, spheres.run_bounds[batch, run], begin * NODES_PER_CLUSTER, ALL_BUNDLES, task
                 )
@@ -279,7 +302,12 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                     receivers, spheres.cluster_bounds[batch, cluster], cluster * NODES_PER_CLUSTER, run_count, task
                 )
                 if count > 0:
-                    cluster_weight = find_cluster_weight(receivers.points, batch, cluster, spheres)
+                    is_merged = cluster < spheres.extents.shape[1] and not is_skipped_partly(
+                        CLUSTER_SIZE * cluster, CLUSTER_SIZE * (cluster + 1), receivers.skip
+                    )
+                    cluster_weight = Lane(0.0)
+                    if is_merged:
+                        cluster_weight = find_cluster_weight(receivers.points, batch, cluster, spheres)
                     adj_cluster_weight = Lane(0.0)
                     for item in range(NODES_PER_CLUSTER):
                         node = find_node(cluster, item, spheres.count, spheres.centers.shape[1])
@@ -289,7 +317,7 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                             merge_weight = cluster_weight
                             sign = 1.0
                         radius = float(0.0)
-                        is_left_out = item < CLUSTER_SIZE and is_skipped(node, node + 1, spheres)
+                        is_left_out = item < CLUSTER_SIZE and is_skipped(node, node + 1, receivers.skip)
                         if node >= 0 and not is_left_out and is_any_above(merge_weight, 0.0):
                             radius = spheres.radii[batch, node]
                         if radius > TINY_RADIUS:
@@ -311,11 +339,12 @@ def make_traversal(cull: wp.Function, visit: wp.Function, Task: type, is_adjoint
                                     add_to_node(adj_sphere.offset, adj_sphere.radius, batch, node, gradients)
                             else:
                                 visit(receivers, sphere_view, count, task)
-                    if wp.static(is_adjoint):
-                        adj_offset = cluster_weight_adjoint(
-                            receivers.points, batch, cluster, adj_cluster_weight, spheres, gradients
-                        )
-                        adj_receivers.points = subtract(adj_receivers.points, adj_offset)
+                    if wp.static(is_adjoint):  # noqa: SIM102  (the forward kernel has none of this)
+                        if is_merged:
+                            adj_offset = cluster_weight_adjoint(
+                                receivers.points, batch, cluster, adj_cluster_weight, spheres, gradients
+                            )
+                            adj_receivers.points = subtract(adj_receivers.points, adj_offset)
         return adj_receivers
 
     return traverse

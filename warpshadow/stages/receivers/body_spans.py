@@ -1,0 +1,168 @@
+"""Body spans: consecutive receivers of one body, by which one launch serves receivers of many bodies.
+
+A block of receivers lies in one span. Kernels leave out the body's own blockers, or read its table.
+"""
+
+import functools
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warpshadow.device.constants import constant
+from warpshadow.device.lanes import block_count
+from warpshadow.device.launch import launch
+from warpshadow.device.memory import empty
+from warpshadow.device.parallel import split_row
+
+
+class Span(NamedTuple):
+    """Consecutive receivers of one body; body −1 has all receivers that share their blockers."""
+
+    body: int
+    first: int
+    end: int
+
+
+def spans_of(bodies: np.ndarray) -> tuple[Span, ...]:
+    """Split a list of bodies into spans of the same body."""
+    changes = np.flatnonzero(np.diff(bodies)) + 1
+    bounds = [0, *changes.tolist(), len(bodies)] if len(bodies) else []
+    return tuple(Span(int(bodies[first]), first, end) for first, end in itertools.pairwise(bounds))
+
+
+def relative_spans(spans: Sequence[Span]) -> tuple[Span, ...]:
+    """Count the receivers of spans from the first of them on."""
+    return tuple(span._replace(first=span.first - spans[0].first, end=span.end - spans[0].first) for span in spans)
+
+
+@wp.struct
+class ReceiverSpans:
+    """Spans that follow each other; no arrays for one of all receivers. Their last item is the end of the last span."""
+
+    receiver_count: int
+    block_count: int  # of an instance
+    first_receivers: wp.array(dtype=wp.int32)  # [span + 1]
+    first_blocks: wp.array(dtype=wp.int32)  # [span + 1], of an instance
+
+
+@wp.struct
+class SpanValues:
+    """A number of each span."""
+
+    single: int  # where there is no array, that of all receivers
+    values: wp.array(dtype=wp.int32)  # [span]
+
+
+@wp.struct
+class ReceiverBlock:
+    """A block of receivers: its instance, its span with the receivers there, and its number among their blocks."""
+
+    batch: int
+    span: int
+    first: int
+    end: int
+    number: int
+
+
+@functools.cache
+def make_find_span(lanes: int) -> wp.Function:
+    """Make the kernel function that finds the block of a row, where the blocks of all instances follow each other."""
+
+    @wp.func(inline=lanes == 1)
+    def find_span(spans: ReceiverSpans, row: int):
+        batch, number = split_row(row, spans.block_count)
+        block = ReceiverBlock()
+        block.batch = batch
+        block.number = number
+        block.end = spans.receiver_count
+        if spans.first_blocks:
+            block.span = wp.lower_bound(spans.first_blocks, number + 1) - 1
+            if wp.static(lanes > 1):  # a single receiver is counted among all: that takes fewer registers
+                block.first = spans.first_receivers[block.span]
+                block.end = spans.first_receivers[block.span + 1]
+                block.number = number - spans.first_blocks[block.span]
+        return block
+
+    return find_span
+
+
+@wp.func
+def span_of_receiver(spans: ReceiverSpans, receiver: int):
+    """The span of a receiver of any instance."""
+    span = int(0)
+    if spans.first_receivers:
+        span = wp.lower_bound(spans.first_receivers, receiver + 1) - 1
+    return span
+
+
+@wp.func
+def value_of_span(values: SpanValues, span: int):
+    """The number of a span."""
+    value = values.single
+    if values.values:
+        value = values.values[span]
+    return value
+
+
+def receiver_spans(spans: Sequence[Span], receiver_count: int, lanes: int, device: wp.Device) -> ReceiverSpans:
+    """Cut spans into blocks.
+
+    Args:
+        spans: Of all receivers, in their order; () for one of all.
+        receiver_count: Number of receivers.
+        lanes: Receivers of a block.
+    """
+    ends = [span.end for span in spans] or [receiver_count]
+    first_receivers = [0, *ends]
+    counts = [block_count(end - first, lanes) for first, end in itertools.pairwise(first_receivers)]
+    result = ReceiverSpans()
+    result.receiver_count, result.block_count = receiver_count, sum(counts)
+    result.first_receivers = result.first_blocks = _no_numbers(device.alias)
+    if len(spans) > 1:
+        result.first_receivers = _put(first_receivers, device)
+        result.first_blocks = _put(list(itertools.accumulate(counts, initial=0)), device)
+    return result
+
+
+def span_values(values: Sequence[int], device: wp.Device) -> SpanValues:
+    """Give numbers of spans to a device."""
+    result = SpanValues()
+    result.single, result.values = values[0], _put(values, device) if len(values) > 1 else _no_numbers(device.alias)
+    return result
+
+
+@functools.cache
+def _no_numbers(device: str) -> wp.array:
+    return wp.empty(0, dtype=wp.int32, device=device)
+
+
+_WRITTEN_AT_ONCE = 64  # numbers that a launch has as arguments
+_Numbers = wp.types.vector(length=_WRITTEN_AT_ONCE, dtype=wp.int32)
+
+
+@wp.kernel(enable_backward=False)
+def _write_numbers(
+    # in
+    numbers: _Numbers,
+    first: int,
+    # out
+    result: wp.array(dtype=wp.int32),
+):
+    """A thread owns a number."""
+    i = wp.tid()
+    result[first + i] = numbers[i]
+
+
+def _put(numbers: Sequence[int], device: wp.Device) -> wp.array:
+    """Give numbers to a device. A graph gets them as arguments of launches: it has other receivers than plain calls."""
+    if not device.is_capturing:
+        return constant(np.array(numbers, np.int32), wp.int32, device)
+    result = empty(len(numbers), dtype=wp.int32, device=device)
+    for first in range(0, len(numbers), _WRITTEN_AT_ONCE):
+        part = numbers[first : first + _WRITTEN_AT_ONCE]
+        arguments = [_Numbers(*part, *[0] * (_WRITTEN_AT_ONCE - len(part))), first]
+        launch(_write_numbers, len(part), inputs=arguments, outputs=[result])
+    return result
