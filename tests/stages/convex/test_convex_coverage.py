@@ -238,7 +238,7 @@ def test_strips_that_touch_cover_as_much_as_the_panel_they_make(device):
 def test_receivers_on_a_compound_see_its_other_parts(device):
     """On the lowest slat, in the plane of the hull's side."""
     placed, some = compound(device)
-    options = {"horizon_normals": wp.array([[(0, 1, 0)]], dtype=wp.vec3, device=device), "skip": 1}
+    options = {"horizon_normals": wp.array([[(0, 1, 0)]], dtype=wp.vec3, device=device), "skips": (1,)}
     point = wp.array([[(0.1, -0.175, 0.03)]], dtype=wp.vec3, device=device)
     found = part_coverage(point, placed, some, DIRECTIONS, on_surface=True, **options).numpy()[0, 0, :, 0]
     above = twin(np.array([0.1, -0.175, 0.03]), DIRECTIONS, cell_radius(32), [[0]], vertices=[SLATS[1].vertices])[:, 0]
