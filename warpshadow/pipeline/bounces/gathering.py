@@ -162,7 +162,7 @@ class BounceGatherer:
     ) -> wp.array:
         planes = outgoing.proxies.planes
         assert planes is not None
-        skip = planes.index_of_body.get(group.spans[0].body)
+        skip = planes.index_of_body.get(group.spans[0].body) if group.spans else None
         if planes.blockers.count == (skip is not None):
             return others
         fronts = group.find_fronts(outgoing.frames, planes.blockers, skip)

@@ -380,7 +380,7 @@ def _groups_that_move(
             body >= 0 and merged_scene.is_glossy[body],
             blockers.convex_parts_around(body) is not None,
         )
-        kind = IdentityKey(self_lookups.get(body)), is_glossy, has_parts, body if is_alone else body >= 0
+        kind = IdentityKey(self_lookups.get(body)), is_glossy, has_parts, ("alone", body) if is_alone else body >= 0
         return span.first < vertex_count, has_spheres, *kind
 
     for (is_at_vertices, has_spheres, *_), consecutive in itertools.groupby(receivers.spans, kind_of):
