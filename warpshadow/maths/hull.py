@@ -13,8 +13,8 @@ from warpshadow.maths.adjacency import area_normals
 from warpshadow.maths.convex import MAX_FACES, ConvexPart, is_panel
 from warpshadow.maths.directions import cell_radius
 
-MAX_EXCESS = 0.03
-"""Mean error up to which a hull is taken, if it also is less than half of that of independent pieces. Measured, and
+MAX_ERROR = 0.03
+"""Mean error up to which a hull is taken, if it also is at most half of that of independent pieces. Measured, and
 that of independent ones: strips that touch 0.000 (0.146), pickets 0.002 (0.104), crates 0.003 (0.018), keys of a
 keyboard 0.009 (0.146), a blind 0.013 (0.112), slats of a shutter 0.021 (0.117), stairs 0.024 (0.120). Not taken: a
 table 0.015 (0.011), bricks 0.032 (0.157), a fence with rails 0.033 (0.095), books 0.042 (0.218), a chair 0.059 (0.034),
@@ -34,7 +34,7 @@ def find_hull(positions: np.ndarray, parts: Sequence[ConvexPart]) -> ConvexPart 
 
     Returns:
         The hull; None of fewer than two pieces, of other pieces than convex solids, where it has more than
-        :data:`.convex.MAX_FACES` faces, or where its bound is off: see :data:`MAX_EXCESS`.
+        :data:`.convex.MAX_FACES` faces, or where its bound is off: see :data:`MAX_ERROR`.
     """
     if len(parts) < 2 or any(part.is_seam or is_panel(part) for part in parts):
         return None
@@ -77,10 +77,8 @@ def _is_close(points: np.ndarray, parts: Sequence[ConvexPart]) -> bool:
     hits = np.stack([_are_hit(points[part.corners[part.faces]], receivers[:, :, None], rays) for part in parts])
     coverages, covered = hits.mean(axis=-1), hits[:-1].any(axis=0).mean(axis=-1)  # [part, receiver, disc]
     bounds, independent = np.minimum(coverages[:-1].sum(axis=0), coverages[-1]), 1 - np.prod(1 - coverages[:-1], axis=0)
-    error, error_if_independent = (
-        np.abs(coverages - covered)[bounds > 0].mean() for coverages in (bounds, independent)
-    )
-    return bool(error <= min(MAX_EXCESS, error_if_independent / 2))
+    error, error_if_independent = (np.abs(estimate - covered)[bounds > 0].mean() for estimate in (bounds, independent))
+    return bool(error <= min(MAX_ERROR, error_if_independent / 2))
 
 
 def _are_hit(faces: np.ndarray, origins: np.ndarray, rays: np.ndarray) -> np.ndarray:

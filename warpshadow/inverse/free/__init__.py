@@ -1,7 +1,7 @@
 """Free parameters of fits: light, lamps, materials, poses, planes, shapes, cameras, exposure.
 
-Each starts where the scene has it. Values are in natural units (radians, half diagonals of bodies, reflectances, the
-targets' own radiance), so that one learning rate serves all.
+Each starts where the scene has it. Values are scaled (turns in radians, shifts in half diagonals of bodies, radiance by
+the targets' own, …), so that one learning rate serves all.
 """
 
 from warpshadow.inverse.free.base import Free

@@ -22,7 +22,7 @@ PRIOR = 1e-3
 
 
 class Free(abc.ABC):
-    """A free parameter of a scene. Fits ask it alone: no other file has a list of classes."""
+    """A free parameter of a scene. Fits ask it for all that most kinds have; only `FREE` lists the classes."""
 
     key: ClassVar[str]
     """Its name in fit files."""

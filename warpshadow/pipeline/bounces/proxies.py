@@ -30,7 +30,7 @@ class SenderPlanes(NamedTuple):
     """The flat bodies among senders."""
 
     blockers: PlaneBlockers
-    index_of_body: dict[int | None, int]  # of each among them, by the number of the body
+    index_of_body: dict[int, int]  # of each among them, by the number of the body
 
 
 class PlacedProxies(NamedTuple):

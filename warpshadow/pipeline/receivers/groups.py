@@ -1,4 +1,4 @@
-"""Receiver groups: receivers with the same blockers, and their visibility."""
+"""Receiver groups: receivers of bodies that are lit by the same launches, and their visibility."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class ReceiverBodies:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Receivers that share their blockers: all bodies, all but their own, or the moving ones."""
+    """Receivers that the same launches light: past all bodies, all but their own, or the moving ones."""
 
     points: wp.array  # [batch, receiver] vec3
     normals: wp.array  # [batch, receiver] vec3
@@ -106,7 +106,7 @@ class Group:
 
     @property
     def body(self) -> int | None:
-        """The body whose receivers they are, where bodies are told apart."""
+        """The body whose receivers they are; None where bodies are not told apart. Not of groups of several."""
         return None if self.receiver_bodies is None else self.receiver_bodies.number
 
     @property

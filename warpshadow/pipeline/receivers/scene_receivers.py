@@ -1,4 +1,4 @@
-"""Which vertices and samples of a scene receive light, and which of them form groups."""
+"""Which vertices and samples of a scene receive light, and which of them are told apart by body."""
 
 from collections.abc import Hashable
 
@@ -51,7 +51,7 @@ class SceneReceivers:
         return self._at_vertices[key]
 
     def separate_bodies(self, blocker_kinds: BlockerKinds) -> np.ndarray | None:
-        """Number of each body whose receivers form a group, −1 for others, shape [body]; None where all share one."""
+        """Number of each body whose receivers are told apart, −1 for others, shape [body]; None where none are."""
         bodies = np.arange(len(self._merged_scene.scene.bodies))
         if self._sends_light:
             return bodies

@@ -38,7 +38,7 @@ class BlockerKinds(NamedTuple):
 
     @property
     def separate(self) -> set[int]:
-        """Bodies whose receivers form a group each."""
+        """Bodies whose receivers are told apart; those lit alike still share a group."""
         return {*self.self_traced, *self.solids, *self.planes}
 
 

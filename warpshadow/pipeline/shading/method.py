@@ -171,7 +171,7 @@ class Method(abc.ABC):
         return self.shell if light.shell is None else light.shell
 
     def cached_transfers(self, points: ShadingContext, shell: Input | None = None) -> Node:
-        """Transfer vectors of points to :attr:`basis`, an array [batch, receiver, coefficient] for each group.
+        """Transfer vectors of points to :attr:`basis`, an array [batch, receiver, coefficient] for each portion.
 
         Args:
             shell: Of the light; None for that of the scene's.
@@ -214,7 +214,7 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def transfers(self, points: ShadingContext, shell: Input | None) -> Node:
-        """Transfer vectors of points to :attr:`basis`, an array for each group, for light from a shell."""
+        """Transfer vectors of points to :attr:`basis`, an array for each portion, for light from a shell."""
 
     @functools.cached_property
     def lobes(self) -> LobeVisibility:

@@ -27,7 +27,7 @@ def check_light(light: object) -> None:
 
 
 def shade_free(transfers: list[wp.array], light: wp.array, *, matrix: np.ndarray | None) -> wp.array:
-    """Light the receivers of all groups by free light, which a matrix converts. Differentiable: transfers, light."""
+    """Light the receivers of all portions by free light, which a matrix converts. Differentiable: transfers, light."""
     maximum = check.LARGEST
     if matrix is not None:
         light, maximum = change_basis(light, matrix), LARGEST_COEFFICIENT

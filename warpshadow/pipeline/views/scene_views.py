@@ -160,7 +160,7 @@ class SceneViews:
         return Input("vertices", geometry.positions), Input("spheres", (geometry.centers, geometry.radii))
 
     def at_points(self, points: wp.array, normals: wp.array, geometry: Geometry | None = None) -> ShadingContext:
-        """Points to be lit by :meth:`shade` that are given, not found in an image.
+        """Points to be lit by :meth:`.SceneRenderer.shade` that are given, not found in an image.
 
         Nobody knows which body a point is on: all spheres and planes block its light, and where light bounces, none
         comes from its own body as such. For points of bodies take :meth:`on_faces`.
@@ -179,7 +179,7 @@ class SceneViews:
         )
 
     def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray, geometry: Geometry | None = None) -> ShadingContext:
-        """Points on faces of bodies to be lit by :meth:`shade`, by whose own bodies it knows them.
+        """Points on faces of bodies to be lit by :meth:`.SceneRenderer.shade`, by whose own bodies it knows them.
 
         Args:
             sides: Face of each, backs numbered after the last face, int of shape [receiver]; receivers of a body are

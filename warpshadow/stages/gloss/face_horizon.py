@@ -69,8 +69,8 @@ def weigh_by_faces(
     """Weigh samples of lobes by where they are above the faces of their receivers.
 
     Args:
-        fragments: Faces that receivers see, −1 for none, [batch, receiver].
-        faces: Vertex indices, vec3i of shape [face].
+        fragments: Sides of faces on which receivers lie, −1 for none, [batch, receiver].
+        faces: Vertices of the sides, vec3i of shape [2 · face].
         positions: Of vertices [scene units], vec3 of shape [batch, vertex].
         normals: Of receivers, whose side counts, vec3 of shape [batch, receiver].
             Any of these batches may be 1 and then serves every instance.

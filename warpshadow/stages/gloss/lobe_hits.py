@@ -1,4 +1,4 @@
-"""Hits of lobes: which faces of bodies their samples meet, and whether metals among them see the sky they mirror.
+"""Hits of lobes: which faces of the shown bodies their samples meet, and whether these would mirror the sky.
 
 Where smooth normals lean away from faces, rays leave below the face that they start on. There is no light from there.
 """
@@ -80,7 +80,7 @@ def _trace_hits(
 
 
 class LobeHits(NamedTuple):
-    """Points of bodies that samples of lobes meet; arrays of shape [receiver, sample]."""
+    """Points of bodies that samples of lobes meet; arrays of shape [receiver, sample], or [batch, receiver, sample]."""
 
     face_ids: wp.array  # sides of faces, int32; −1 for a sample that meets no such body: it has no other number
     barycentrics: wp.array  # vec3

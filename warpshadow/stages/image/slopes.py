@@ -21,7 +21,7 @@ These steps add up along a row to the color at the surface's right edge minus th
 contribute with the other sign. So the two cancel, as they must, if
 
 - the step to an edge follows the edge's point, and
-- a sample counts along a row as far as its surface reaches there: 1, or ½ + t beside an edge (along a column likewise).
+- a sample counts along a row as far as its surface reaches there: 1, ½ + t beside an edge, t + t′ between two.
   The smoothed image weighs it once for both axes; so slopes are multiplied by extent / weight.
 
 *Near* an outline, up to :data:`REACH` steps from it, mean slopes also replace exact derivatives, which are kept

@@ -19,7 +19,7 @@ from warpshadow.device.parallel import split_row
 
 
 class Span(NamedTuple):
-    """Consecutive receivers of one body; body −1 has all receivers that share their blockers."""
+    """Consecutive receivers of one body; body −1 has receivers whose body is not told apart."""
 
     body: int
     first: int
@@ -58,7 +58,10 @@ class SpanValues:
 
 @wp.struct
 class ReceiverBlock:
-    """A block of receivers: its instance, its span with the receivers there, and its number among their blocks."""
+    """A block of receivers: its instance, its span with the receivers there, and its number among their blocks.
+
+    With one lane, receivers and the number are among all of the instance.
+    """
 
     batch: int
     span: int

@@ -46,7 +46,7 @@ class Receivers(NamedTuple):
     receiver_of_vertex: wp.array  # [vertex, then their backs if fragments have sides] int32, receiver or -1 for none
     fragments: Fragments  # of these faces
     static_vertices: np.ndarray = np.empty(0, int)  # [static vertex], the vertices that the first receivers are
-    spans: tuple[Span, ...] = ()  # of the others, where bodies are told apart; () for one group
+    spans: tuple[Span, ...] = ()  # of the others, where bodies are told apart; else ()
     vertices: wp.array | None = None  # int32, the vertex or back of each vertex receiver, [vertex receiver]
     sample_fragments: Fragments | None = None  # side and barycentrics of each sample receiver, [batch, sample receiver]
     samples: wp.array | None = None  # [view, sample receiver] int32, the sample that owns each, −1 for none
@@ -204,7 +204,7 @@ def number_receivers(
         sequence: All vertices in the sequence in which they become receivers, shape [vertex]: light is found fastest
             where neighbors follow each other. None for the mesh's.
         bodies: Body of each vertex, −1 for vertices that need not be told apart, shape [vertex]: receivers of a body
-            then follow each other. None where all share their blockers.
+            then follow each other. None where none need be told apart.
         device: Where they are.
     """
     side_count, vertex_count = keeps_vertex.shape
@@ -400,7 +400,7 @@ def receivers_on_faces(
         sides: Faces, from the front or from behind, int of shape [receiver].
         barycentrics: Where on them, shape [receiver, 3].
         bodies: Body of each, −1 for receivers that need not be told apart, shape [receiver], runs of the same one after
-            another. None where all share their blockers.
+            another. None where none need be told apart.
     Differentiable: positions, normals.
     """
     device = positions.device
