@@ -95,6 +95,27 @@ def test_sums_are_the_same_to_the_bit_for_any_number_of_threads():
     assert totals[0] != np.float32(3) + np.cumsum(values)[-1]  # they are the slices' sums, not one after the other
 
 
+@wp.kernel(enable_backward=False)
+def _add_to_last(
+    first_row: int,
+    worker: int,
+    # in
+    values: wp.array(dtype=wp.float32),
+    # sums
+    totals: wp.array4d(dtype=wp.float32),
+):
+    """A thread owns a value."""
+    wp.atomic_add(totals, 1, 0, 0, 1, values[first_row + wp.tid()])
+
+
+def test_sums_have_as_many_dimensions_as_an_array_can():
+    parallel.set_thread_count(2)
+    values = np.arange(1000, dtype=np.float32)
+    totals = wp.full((2, 1, 1, 2), 3.0, dtype=wp.float32, device="cpu")
+    launch(_add_to_last, 1000, inputs=[wp.array(values, device="cpu")], outputs=[], sums=[totals], cost=1e4)
+    np.testing.assert_array_equal(totals.numpy().ravel(), [3, 3, 3, values.sum() + 3])
+
+
 def test_short_launches_are_not_divided():
     parallel.set_thread_count(4)
     assert set(spread(np.ones(100), cost=1.0)[1]) == {0}

@@ -227,14 +227,15 @@ def _launch_slices(
     if slice_count == 1:
         warp_internals.bound_kernel(kernel, arguments, device, gradients=gradients)(dim)
         return
-    slice_sums = {
-        argument_index: zeros((slice_count, *array.shape), array.dtype, device=device)
+    slice_sums = {  # along the first axis: an array has four at most
+        argument_index: zeros((slice_count * array.shape[0], *array.shape[1:]), array.dtype, device=device)
         for argument_index, array in summed_arguments.items()
     }
     kernel.module.load(device, 1)  # compiled here, not by each thread
     for argument_index, parts in slice_sums.items():
-        view = warp_internals.contiguous_view(parts, parts.shape[1:], parts.dtype)
-        first_part = parts[0] if view is None else view
+        shape = summed_arguments[argument_index].shape
+        view = warp_internals.contiguous_view(parts, shape, parts.dtype)
+        first_part = parts[: shape[0]] if view is None else view
         if gradients is None:
             arguments[argument_index] = first_part
         else:
@@ -249,15 +250,18 @@ def _launch_slices(
     starts = [dim[0] * k // slice_count for k in range(slice_count + 1)]
 
     def run(number: int, worker: int) -> None:
-        offsets = {argument_index: number * parts.strides[0] for argument_index, parts in slice_sums.items()}
+        offsets = {
+            argument_index: number * parts.shape[0] // slice_count * parts.strides[0]
+            for argument_index, parts in slice_sums.items()
+        }
         launch((starts[number + 1] - starts[number], *dim[1:]), starts[number], worker, offsets=offsets)
 
     _share(run, slice_count, workers)
     for argument_index, parts in slice_sums.items():
-        total, *others = np.asarray(parts)
+        sums = np.asarray(summed_arguments[argument_index])
+        total, *others = np.asarray(parts).reshape(slice_count, *sums.shape)
         for other in others:
             total += other
-        sums = np.asarray(summed_arguments[argument_index])
         sums += total
 
 

@@ -143,16 +143,19 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
         ...
 
     @wp.func
-    def load_visibility(rows: Rows, uses_rays: int, index: int, table: BodyTable):
-        """S of a ray or coarse cell in a row of each receiver, from 0 to 1."""
+    def load_visibility(rows: Rows, uses_rays: int, index: int, tables: wp.array(dtype=BodyTable), body: int):
+        """S of a ray or coarse cell in a row of each receiver, from 0 to 1.
+
+        The table is read at each lookup: held over all of them, it takes 12 registers more.
+        """
         visibility = Lane()
         for lane in range(lanes):
             if uses_rays == 1:
                 visibility[lane] = float(
-                    int((table.bits[rows[lane], index >> 5] >> wp.uint32(index & 31)) & wp.uint32(1))
+                    int((tables[body].bits[rows[lane], index >> 5] >> wp.uint32(index & 31)) & wp.uint32(1))
                 )
             else:
-                word = table.words[rows[lane], index // _CELLS_PER_WORD]
+                word = tables[body].words[rows[lane], index // _CELLS_PER_WORD]
                 byte = (word >> wp.uint32(8 * (index % _CELLS_PER_WORD))) & wp.uint32(255)
                 visibility[lane] = float(int(byte)) * (1.0 / 255.0)
         return visibility
@@ -162,14 +165,16 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
         """Load a block of receivers, and S of all coarse cells where there are several."""
         block = find_span(inputs.spans, row)
         probes = load_probes(inputs, block)
-        table = inputs.tables[value_of_span(inputs.table_of_span, block.span)]
+        body = value_of_span(inputs.table_of_span, block.span)
         if wp.static(lanes > 1):
             for cell in range(cell_visibility.shape[0]):
                 cell_visibility[cell] = Lane(0.0)
             for corner in range(probes.corner_count):
-                add_cell_visibility(probes.rows[corner], probes.weights[corner], table.words, cell_visibility)
+                add_cell_visibility(
+                    probes.rows[corner], probes.weights[corner], inputs.tables[body].words, cell_visibility
+                )
         normals = inputs.normals[instance_in(block.batch, inputs.normals.shape[0])][block.first : block.end]
-        return block, load(normals, block.number), probes, table
+        return block, load(normals, block.number), probes, body
 
     return _ProbeFunctions(load_block, add_cell_visibility, load_visibility)
 
@@ -195,9 +200,8 @@ def _make_gather(lanes: int) -> wp.Kernel:
         item = first_row + wp.tid()
         cell_visibility = scratch[scratch_slot(worker, item), 0]
         columns = scratch[scratch_slot(worker, item), 1]
-        block, normal, probes, table = load_block(inputs, item, cell_visibility)
+        block, normal, probes, body = load_block(inputs, item, cell_visibility)
         weight_batch = instance_in(block.batch, inputs.counts.shape[0])
-        body = value_of_span(inputs.table_of_span, block.span)
         kernels = inputs.kernels[body]
         rows = transmittance_self[block.batch][block.first : block.end]
         for q in range(inputs.directions.shape[0]):
@@ -209,9 +213,12 @@ def _make_gather(lanes: int) -> wp.Kernel:
                 uses_rays = kernels.uses_rays[q]
                 if wp.static(lanes == 1) or uses_rays == 1:
                     for k in range(inputs.counts[weight_batch, body, q]):
-                        for corner in range(probes.corner_count):
-                            visibility = load_visibility(probes.rows[corner], uses_rays, indices[k], table)
-                            transmittance += weights[k] * wp.cw_mul(probes.weights[corner], visibility)
+                        for corner in range(3):
+                            if corner < probes.corner_count:
+                                visibility = load_visibility(
+                                    probes.rows[corner], uses_rays, indices[k], inputs.tables, body
+                                )
+                                transmittance += weights[k] * wp.cw_mul(probes.weights[corner], visibility)
                 else:
                     for k in range(inputs.counts[weight_batch, body, q]):
                         transmittance += weights[k] * cell_visibility[indices[k]]
@@ -255,9 +262,8 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
         item = first_row + wp.tid()
         cell_visibility = scratch[scratch_slot(worker, item), 0]
         adj_cell_visibility = scratch[scratch_slot(worker, item), 1]
-        block, normal, probes, table = load_block(inputs, item, cell_visibility)
+        block, normal, probes, body = load_block(inputs, item, cell_visibility)
         weight_batch = instance_in(block.batch, inputs.counts.shape[0])
-        body = value_of_span(inputs.table_of_span, block.span)
         kernels = inputs.kernels[body]
         first_receiver = block.first + block.number * lanes
         if wp.static(lanes > 1):
@@ -282,7 +288,8 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                         for corner in range(3):
                             if corner < probes.corner_count:
                                 adj_visibility = wp.cw_mul(
-                                    adj, load_visibility(probes.rows[corner], uses_rays, indices[k], table)
+                                    adj,
+                                    load_visibility(probes.rows[corner], uses_rays, indices[k], inputs.tables, body),
                                 )
                                 adj_corner_weights[corner] += weights[k] * adj_visibility
                                 adj_weight += total(wp.cw_mul(probes.weights[corner], adj_visibility))
@@ -308,7 +315,7 @@ def _make_gather_adjoint(lanes: int) -> wp.Kernel:
                 if wp.static(lanes > 1):
                     for cell in range(cell_visibility.shape[0]):
                         cell_visibility[cell] = Lane(0.0)
-                    add_cell_visibility(probes.rows[corner], Lane(1.0), table.words, cell_visibility)
+                    add_cell_visibility(probes.rows[corner], Lane(1.0), inputs.tables[body].words, cell_visibility)
                     for cell in range(cell_visibility.shape[0]):
                         adj_corner += wp.cw_mul(adj_cell_visibility[cell], cell_visibility[cell])
                 for lane in range(receiver_count):

@@ -152,7 +152,7 @@ def _find_weights(
     item, direction = split_row(first_row + wp.tid(), all_counts.shape[2])
     batch, body = split_row(item, all_counts.shape[1])
     kernels = table[body]
-    counts, indices, weights = all_counts[batch, body], all_indices[batch, body], all_weights[batch, body]
+    indices, weights = all_indices[batch, body, direction], all_weights[batch, body, direction]
     rotation = rotations[batch, bodies[body]]
     _rotated_direction, kernel_axis, cos_radius, candidates = _load_kernel(kernels, rotation, direction)
     count = int(0)
@@ -162,18 +162,18 @@ def _find_weights(
         if wp.dot(kernels.cells[cell], kernel_axis) > kernels.cos_outer_radii[direction]:
             for candidate in range(width * cell, width * cell + width):
                 profile = _profile(wp.dot(candidates[candidate], kernel_axis), cos_radius)
-                if profile > 0.0 and count < weights.shape[1]:
-                    indices[direction, count] = candidate
-                    weights[direction, count] = profile * profile
+                if profile > 0.0 and count < weights.shape[0]:
+                    indices[count] = candidate
+                    weights[count] = profile * profile
                     weight_sum += profile * profile
                     count += 1
-    counts[direction] = count
-    for k in range(weights.shape[1]):
+    all_counts[batch, body, direction] = count
+    for k in range(weights.shape[0]):
         if k < count:
-            weights[direction, k] = weights[direction, k] / weight_sum
+            weights[k] = weights[k] / weight_sum
         else:
-            indices[direction, k] = 0
-            weights[direction, k] = 0.0
+            indices[k] = 0
+            weights[k] = 0.0
 
 
 @wp.kernel(enable_backward=False)

@@ -59,6 +59,9 @@ _OPAQUE_BELOW = 1.0e-4  # below this transmittance a bundle is not looked at any
 
 PAIR_COST = 0.15  # nanoseconds that a sphere costs for a receiver and a direction, culling included
 
+_LAUNCH_BOUNDS = 256, 3
+"""Threads that a multiprocessor has registers for, in blocks: 80 a thread, where spans' skips would take up to 96."""
+
 
 @functools.cache
 def _task_type(lanes: int) -> Any:
@@ -164,7 +167,9 @@ def _make_transmit(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.Ke
     cull = make_cull(has_horizon, TransmittanceTask, lanes, has_footprints)
     traverse = make_traversal(cull, visit, TransmittanceTask, False, lanes)
 
-    @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
+    @wp.kernel(
+        module="unique", module_options=module_options(lanes), enable_backward=False, launch_bounds=_LAUNCH_BOUNDS
+    )
     def transmit(
         first_row: int,
         worker: int,
