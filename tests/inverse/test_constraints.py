@@ -324,6 +324,14 @@ def test_a_body_that_touches_the_plane_stands_as_in_the_scene_and_the_result_say
     assert str(result.uncertainty.poses["box"]).endswith("°; it stands 1.2° off its stable support")
 
 
+def test_a_body_on_another_side_than_its_stable_one_stands_so_without_a_warning():
+    placed = box((40.0, 0.0, 0.0)).on_ground((0.2, 0.0, 0.1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        free, context, values = prepared(scene(placed), Pose("box", stands_on="table"))
+    np.testing.assert_allclose(moved_body(free, context, values).rotation_matrix(), placed.rotation_matrix(), atol=1e-6)
+
+
 def test_a_body_that_nearly_stands_keeps_the_rotation_of_the_scene():
     where = scene(box((0.8, 30.0, 0.0)))
     with warnings.catch_warnings():

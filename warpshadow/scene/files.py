@@ -205,6 +205,8 @@ def turned_light(light: KnownLightArgument, rotation: float, scale: float) -> Kn
 
 def _body(table: Table, folder: Path) -> Body:
     toml_tables.check_table(table)
+    if not {"mesh", "primitive"} & {*table}:
+        _check_keys("[[body]]", table)  # a misspelled "mesh"
     if ("mesh" in table) == ("primitive" in table):
         raise ValueError(f'expected either mesh = "FILE" or primitive = one of {", ".join(map(repr, _PRIMITIVES))}')
     for one, other in (("albedo", "texture"), ("blockers", "spheres")):

@@ -26,6 +26,7 @@ _TURNS = np.array(
 
 
 _MAX_TILT = 1.0  # degrees from the nearest stable support up to which a body stands as the scene has it
+_OTHER_SIDE = 30.0  # degrees beyond which a body that touches its plane is meant to stand on another side
 _MAX_GAP = 1e-3  # part of a body's diagonal by which it may be off a plane that it touches
 
 
@@ -174,6 +175,8 @@ class Pose(FreeOfBody):
         diagonal = 2 * body.scale * context.extent(self.number)
         gap = float((body.world_points() @ plane.normal).min()) - plane.offset
         if self.resting is None and not is_scan and abs(gap) < _MAX_GAP * diagonal:
+            if angle > _OTHER_SIDE:
+                return start, ""
             rotation, remark = start, f"stands {angle:.2g}° off its stable support"
             remedy = 'resting = "stable" turns it there'
         else:
