@@ -416,7 +416,7 @@ def test_a_missing_file_of_spheres_or_colors_is_named(refused, line):
         (TABLES + "color = [1, 0, 0]\n", "unknown key 'color' (did you mean 'albedo'?)"),
         (TABLES + "foot = [1, 0, 0]\n", "unknown key 'foot' (did you mean 'translation'?)"),
         (TABLES + "height = 2\n", "unknown key 'height' (did you mean 'on_ground'?)"),
-        (TABLES.replace("mesh =", "mehs ="), "unknown key 'mehs' (did you mean 'mesh'?)"),
+        (TABLES.replace("primitive =", "primitve ="), "unknown key 'primitve' (did you mean 'primitive'?)"),
         (TABLES.replace("eye =", "position ="), "unknown key 'position' (did you mean 'eye'?)"),
         (TABLES.replace("target =", "look_at ="), "unknown key 'look_at' (did you mean 'target'?)"),
         (
