@@ -397,7 +397,7 @@ def test_the_error_of_a_shadow_is_relative_to_it():
 
 def test_a_ragged_shadow_costs_one_warning_for_a_mesh_with_the_remedy(monkeypatch):
     report = stage_3.FitReport(64, 0.9, 0.1, 0.02, 0.02, 0.02, shadow_error=0.21, seconds=1.0)
-    monkeypatch.setattr(fit_module, "_fit", lambda *_: (np.ones((1, 4), np.float32), report))
+    monkeypatch.setattr(fit_module._MeshFits, "fit", lambda *_: (np.ones((1, 4), np.float32), report))
     thin, others = bumpy(), {"count": 64, "cache": False}
     with pytest.warns(UserWarning, match='.mesh. is thin for 64 spheres: .*21%.*blockers = "auto".*ray-traced') as told:
         fit_spheres(thin, **others)
