@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
-from warpshadow.device.constants import cached_by_values, gather_of_owners, immutable
+from warpshadow.device.constants import cached_by_values, constant, gather_of_owners, immutable
 
 
 def test_arrays_are_compared_by_values_and_immutable_ones_by_identity():
@@ -30,3 +31,11 @@ def test_values_of_owners_are_made_once_for_equal_values():
     values = gather_of_owners(np.array([5, 6, 7]), owners)
     assert values.tolist() == [5, 5, 7, 6] and gather_of_owners(np.array([5, 6, 7]), owners) is values
     assert gather_of_owners(np.array([True, False, True]), owners).tolist() == [True, True, True, False]
+
+
+def test_values_in_use_outlive_those_that_are_not():
+    """A graph takes the constants of the call before it, however early equal values came first."""
+    used = constant(np.array([7.0, 11.0]), wp.float32, "cpu")
+    for number in range(400):
+        constant(np.array([float(number), -1.0]), wp.float32, "cpu")
+        assert constant(np.array([7.0, 11.0]), wp.float32, "cpu") is used

@@ -1,5 +1,6 @@
 """Constants of kernels: values of the host that a device is given once."""
 
+import collections
 import contextlib
 import functools
 import weakref
@@ -12,7 +13,7 @@ import warp as wp
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_MAX_RESULTS = 256  # results of a function that are cached; the oldest go first
+_MAX_RESULTS = 256  # results of a function that are cached; those not used for longest go first
 
 _collections: dict[int, list[Any]] = {}  # by their identity
 
@@ -38,7 +39,7 @@ def cached_by_values(function: Callable[P, R]) -> Callable[P, R]:
 
     Nobody may change a result. The constants that it used count as used at every call.
     """
-    results: dict[Hashable, tuple[R, list[Any]]] = {}
+    results: collections.OrderedDict[Hashable, tuple[R, list[Any]]] = collections.OrderedDict()
 
     @functools.wraps(function)
     def cached(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -51,8 +52,11 @@ def cached_by_values(function: Callable[P, R]) -> Callable[P, R]:
             while len(results) >= _MAX_RESULTS:
                 results.pop(next(iter(results)), None)
             results[key] = cached_result
-        elif _collections:
-            note_use(*cached_result[1])
+        else:
+            with contextlib.suppress(KeyError):  # another thread may have dropped it
+                results.move_to_end(key)
+            if _collections:
+                note_use(*cached_result[1])
         return cached_result[0]
 
     return cached
