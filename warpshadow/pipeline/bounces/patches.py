@@ -11,6 +11,7 @@ import warp as wp
 
 from warpshadow.assets.mesh import Mesh
 from warpshadow.device.batch import rows
+from warpshadow.maths.adjacency import area_normals
 from warpshadow.maths.contacts import Contact
 from warpshadow.maths.plane import plane_normal
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
@@ -254,8 +255,8 @@ class Senders:
         merged_scene, entries = self.merged_scene, []
         for number, first, item in zip(self.bodies, self.first[:-1], self.patches, strict=True):
             mesh = merged_scene.scene.bodies[number].mesh
-            a, b, c = item.pieces.positions(mesh.positions, mesh.surface.faces).swapaxes(0, 1)
-            areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) + 1e-30
+            corners = item.pieces.positions(mesh.positions, mesh.surface.faces)
+            areas = np.linalg.norm(area_normals(corners), axis=1) + 1e-30
             for is_back, owners in enumerate(item.patch_of_pieces):
                 sides = item.pieces.faces + merged_scene.first_face[number] + is_back * merged_scene.first_face[-1]
                 entries.append(np.stack([areas, sides, owners + first])[:, owners >= 0])

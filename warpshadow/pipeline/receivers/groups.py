@@ -93,9 +93,7 @@ class Group:
     planes: GroupPlanes | None = None  # bodies that block as planes; None without any
     convex_parts_around: GroupConvexParts | None = None  # bodies that block as convex parts; None without any
     nearest_blockers: NearestBlockers | None = None  # None where receivers are not patch samples
-    self_spheres: Mapping[int, tuple[int, int]] = field(
-        default_factory=dict
-    )  # of bodies that do not block their own light by spheres
+    self_spheres: Mapping[int, tuple[int, int]] = field(default_factory=dict)  # of bodies whose own light they let pass
     clusters: ClusterTree | None = None  # of the spheres, where they are found already
     footprints: wp.array | None = None  # [batch, receiver] vec3, areas for which they stand; None for points
 
@@ -274,15 +272,16 @@ class Blockers(NamedTuple):
     def planes_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupPlanes | None:
         """Flat bodies around receivers of one body: all that block, or some."""
         planes = self.blocker_kinds.planes
-        chosen, skip = _choose_blocking(planes, body, of_bodies)
+        chosen = _choose_blocking(planes, body, of_bodies)
         if self.frames is None or not chosen:
             return None
+        skip = planes.index(body) if body in planes else None
         return GroupPlanes(self.planes.blockers(planes, chosen), self.frames, skip)
 
     def convex_parts_around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupConvexParts | None:
         """Convex parts of bodies around receivers of one body: all that block, or some."""
         bodies = self.blocker_kinds.convex
-        chosen, _ = _choose_blocking(bodies, body, of_bodies)
+        chosen = _choose_blocking(bodies, body, of_bodies)
         if self.placed_parts is None or not chosen:
             return None
         return GroupConvexParts(self.parts.blockers(bodies, chosen), self.placed_parts, bodies)
@@ -301,12 +300,10 @@ class Blockers(NamedTuple):
         return Group(points, normals, *spheres, planes=planes, convex_parts_around=parts, footprints=footprints)
 
 
-def _choose_blocking(
-    bodies: tuple[int, ...], body: int, of_bodies: Iterable[int] | None
-) -> tuple[tuple[int, ...], int | None]:
-    """Bodies of one kind that block light around a body, () if none but itself does; and which of them it is itself."""
+def _choose_blocking(bodies: tuple[int, ...], body: int, of_bodies: Iterable[int] | None) -> tuple[int, ...]:
+    """Bodies of one kind that block light around a body, () if none but itself does."""
     chosen = bodies if of_bodies is None else tuple(number for number in bodies if number in of_bodies)
-    return chosen if set(chosen) - {body} else (), bodies.index(body) if body in bodies else None
+    return chosen if set(chosen) - {body} else ()
 
 
 def find_portions(
@@ -376,10 +373,8 @@ def _groups_that_move(
         if merged_scene.scene.bounces and body not in self_lookups and body not in kinds.solids:
             is_alone = True
         has_spheres = self_spheres.get(body, (0, 0)) != (0, spheres[1].shape[1])
-        is_glossy, has_parts = (
-            body >= 0 and merged_scene.is_glossy[body],
-            blockers.convex_parts_around(body) is not None,
-        )
+        is_glossy = body >= 0 and merged_scene.is_glossy[body]
+        has_parts = blockers.convex_parts_around(body) is not None
         kind = IdentityKey(self_lookups.get(body)), is_glossy, has_parts, ("alone", body) if is_alone else body >= 0
         return span.first < vertex_count, has_spheres, *kind
 

@@ -187,7 +187,7 @@ class Gradients:
 
 @functools.cache
 def make_add_to_node(lanes: int) -> wp.Function:
-    """Make the kernel function that adds those of a block to the gradients of a node."""
+    """Make the kernel function that adds the gradients of a block to those of a node."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     total = make_lane_functions(lanes).total
 

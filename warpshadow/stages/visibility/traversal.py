@@ -236,7 +236,7 @@ def sphere_view_type(lanes: int) -> Any:
         node: int
         offset: Vectors  # from the receivers to its center
         curvature: float  # 1/radius
-        cone: Cone  # its weight has that of merging as a factor
+        cone: Cone  # its weight has merge_weight as a factor
         merge_weight: Lane  # that merging gives the sphere
 
     return SphereView
