@@ -59,7 +59,7 @@ def _open_share(coverage: wp.vec4, other: wp.vec4):
 
 @wp.func
 def _is_partial(coverage: wp.vec4):
-    """Whether a blocker covers a cell in part; else it has no gradient."""
+    """Whether a blocker covers a part of a cell only; other coverage has no gradient."""
     return coverage[0] > 0.0 and coverage[0] < 1.0
 
 

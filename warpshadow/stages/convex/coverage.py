@@ -47,7 +47,7 @@ _PART_COST = 200.0  # mean time of a part of a receiver [ns]
 
 
 class _PartFunctions(NamedTuple):
-    """Kernel functions on the parts of a compound, which is a single piece if it has no hull."""
+    """Kernel functions on compounds: the pieces of a body with a hull are one; any other piece is one by itself."""
 
     prepare_block: wp.Function
     is_blocking: wp.Function
@@ -106,7 +106,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
 
     @wp.func
     def bound_by_hull(inputs: PartInputs, hull: int, task: PartsTask, covered_count: int):
-        """Where the hull of a compound covers less of a cell than its parts together, it is the hull that covers."""
+        """Replace the coverage by a compound's parts by that of its hull in cells of which the hull covers less."""
         bound = find_bound(inputs, hull, task)
         silhouette = task.silhouette
         count, is_solid = find_silhouette(inputs.parts, hull, silhouette)
@@ -128,13 +128,13 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
 
     @wp.func
     def cover_by_compound(inputs: PartInputs, compound: int, task: PartsTask):
-        """Coverage by a compound of cells that no other covers wholly; returns how many it covers, and lists them."""
+        """Find the cells that a compound covers, and how; ``task.covered`` lists them. Return their number."""
         parts, cells, radius = inputs.parts, inputs.cells, inputs.radius
         first = parts.first_part[parts.first_piece[compound]]
         end = parts.first_part[parts.first_piece[compound + 1]]
         covered_count = int(0)
         silhouette = task.silhouette
-        max_sum = wp.where(parts.signs[end - 1] < 0.0, 1.0e30, 1.0)  # seams take off
+        max_sum = wp.where(parts.signs[end - 1] < 0.0, 1.0e30, 1.0)  # seams, subtracted later, bring a sum above 1 back
         for part in range(first, end):
             bound = find_bound(inputs, part, task)
             sign = parts.signs[part]
@@ -231,7 +231,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
 
     @wp.func(inline=True)
     def is_any(coverage: Coverages):
-        """Whether anything is not 0."""
+        """Whether any number of the coverage is not 0."""
         moment = coverage.moment
         highest = wp.max(wp.max(coverage.cell_share, moment.x), wp.max(moment.y, moment.z))
         lowest = wp.min(wp.min(coverage.cell_share, moment.x), wp.min(moment.y, moment.z))
@@ -277,7 +277,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
                 q = task.covered[k]
                 adj = adj_sums[task.slot, q]
                 adj_coverage = blocker_adjoint(task.sums[q], adj, task.coverage[q])
-                # of equal ones, as the front and the back of a mug at its outline, the first is the largest
+                # one blocker has the gradient of max h: of equal ones, as both sides of a mug at its outline, the first
                 difference = task.sums[q].largest - task.coverage[q].cell_share
                 adj.largest = wp.cw_mul(adj.largest, is_positive(wp.max(difference, -difference)))
                 adj_sums[task.slot, q] = adj

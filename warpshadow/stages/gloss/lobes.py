@@ -157,7 +157,7 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
 
     @wp.func
     def load_or_zero(vectors: wp.array(dtype=wp.vec3), first: int):
-        """A block of vectors; zeros past the last, which sums over lanes count in."""
+        """Load a block of vectors, zeros past the last, since sums over lanes include those."""
         x = Lane()
         y = Lane()
         z = Lane()

@@ -69,7 +69,7 @@ def _mirror(
 
 
 class MirroredDirections(NamedTuple):
-    """Where bodies that lobes meet mirror light from; that of other samples is the sample itself."""
+    """Directions from which the bodies that lobes meet mirror light; samples that meet none keep their own."""
 
     directions: wp.array  # l', vec3 of shape [batch, receiver, sample]
     fresnel_weights: wp.array  # (1 − |n·l|)⁵, float32 of the same shape

@@ -103,7 +103,7 @@ def _level_offsets(texel_count: int) -> np.ndarray:
 
 @wp.struct
 class TexelPlace:
-    """Four texels of a level around a direction, and where it is between them."""
+    """The four texels of a level around a direction, and its position between them."""
 
     upper_left: int
     upper_right: int
@@ -147,7 +147,7 @@ def _interpolate_texels(texels: wp.array(dtype=wp.vec3), place: TexelPlace):
 
 @wp.func
 def _slopes(texels: wp.array(dtype=wp.vec3), place: TexelPlace, adj: wp.vec3):
-    """The gradient's product with the light of a level, and with its slopes along rows and columns."""
+    """Products of the gradient with the light of a level, and with its slopes along rows and columns."""
     upper_left = wp.dot(adj, texels[place.upper_left])
     upper_right = wp.dot(adj, texels[place.upper_right])
     lower_left = wp.dot(adj, texels[place.lower_left])
@@ -171,7 +171,7 @@ def _add_to_texels(adj: wp.vec3, place: TexelPlace, adj_texels: wp.array(dtype=w
 
 @wp.func
 def _find_height(blur: float, texels_per_radian: float):
-    """Height of a blur [radians] over level 0, in levels."""
+    """Level, from 0 on and fractional, whose blur is the given one [radians]."""
     # half a texel of the map itself is between levels 0 and 1
     return wp.clamp(wp.log2(wp.max(blur * texels_per_radian, 0.5)) + 1.0, 0.0, float(_LEVELS) - 1.001)
 

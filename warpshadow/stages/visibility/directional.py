@@ -65,7 +65,7 @@ _LAUNCH_BOUNDS = 256, 3
 
 @functools.cache
 def _task_type(lanes: int) -> Any:
-    """Struct of a thread's work: a span of bundles of directions."""
+    """Struct of a thread's slice of bundles of directions, and memory for it."""
     Lane = lane_type(lanes)
 
     @wp.struct
@@ -119,7 +119,7 @@ def _make_attenuate(lanes: int) -> wp.Function:
 
     @wp.func(inline=True)
     def attenuate(cap: Cap, slope: Lane, opacity: Lane, bundle: int, task: TransmittanceTask):
-        """Returns whether any light is left."""
+        """Multiply the transmittance of a bundle; return whether any light is left."""
         max_transmittance = Lane(0.0)
         direction = (task.first_bundle + bundle) * BUNDLE
         slot = bundle * BUNDLE
