@@ -7,7 +7,8 @@ the mean radiance R̄ of the receiver's blockers the point adds
 
 m how metallic it is, a its albedo, B the radiosity of its side of the face, and L' the radiance from l': R̄ where that
 ray meets a body, 0 where it leaves below the face that it starts on (:mod:`.lobe_hits`), else L, light without shadows,
-blurred by σ'² = σ² + 2 α²: σ is the blur of the sample (:mod:`.lobes`), √2 α that of a whole lobe, seen from above.
+blurred by σ'² = σ² + 2 α², since variances of Gaussians add: σ is the blur of the sample (:mod:`.lobes`), and √2 α the
+σ of a lobe's only sample, N = K = 1, seen from above, v = h = n, where |W| = α² and μ = Λ = 1.
 Where l itself leaves below the receiver's face, M = −(1 − T) R̄. Where light bounces along paths, B is R̄.
 """
 
