@@ -62,7 +62,7 @@ _SUMS = 4  # Σ w a L, of three colors, and Σ w a S
 
 @functools.cache
 def _task_type(lanes: int) -> Any:
-    """Struct of a thread's slice of bundles of directions, and memory for it."""
+    """Struct of a thread's work: a span of bundles of directions."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.struct

@@ -58,7 +58,7 @@ def check_planes(
 
 @functools.lru_cache(64)
 def plane_arrays(planes: PlaneBlockers, radius: float, skip: int | None) -> PlaneArrays:
-    """Plane blockers and the radius of cells [rad] for kernels; ``skip`` is the receivers' own plane, if any."""
+    """Plane blockers as seen in cells of a radius [rad] by receivers that are part of one, or of none."""
     arrays = PlaneArrays()
     arrays.grids, arrays.levels, arrays.level_scales = planes.grids, planes.levels, planes.level_scales
     arrays.covered, arrays.edges, arrays.edge_axes = planes.covered, planes.edges, planes.edge_axes

@@ -65,7 +65,7 @@ _LAUNCH_BOUNDS = 256, 3
 
 @functools.cache
 def _task_type(lanes: int) -> Any:
-    """Struct of a thread's slice of bundles of directions, and memory for it."""
+    """Struct of a thread's work: a span of bundles of directions."""
     Lane = lane_type(lanes)
 
     @wp.struct
