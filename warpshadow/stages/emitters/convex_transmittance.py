@@ -66,14 +66,14 @@ class Border:
 
 @wp.func
 def _sees(planes: wp.array(dtype=wp.vec4), face: int, point: wp.vec3, margin: float):
-    """Whether a point is on the outer side of a face's plane."""
+    """Whether a point is before a face."""
     plane = planes[face]
     return wp.dot(wp.vec3(plane[0], plane[1], plane[2]), point) - plane[3] > -margin
 
 
 @wp.func
 def _nearest_border(parts: PlacedPartArrays, part: int, beam: Beam):
-    """Find the edge and face nearest to a beam; a panel of which a receiver sees both sides, or none, has none."""
+    """The nearest edge and face. Receivers that see both sides of a panel, or none, have none."""
     margin = _ON_FACE * parts.bounds[part][3]
     first_face = parts.arrays.first_face[part]
     border = Border()
@@ -113,7 +113,7 @@ def _nearest_border(parts: PlacedPartArrays, part: int, beam: Beam):
 
 @wp.func
 def _blocked_share_within(border: Border, beam: Beam):
-    """Blocked share a of a beam by a part, given the border nearest to it."""
+    """The share a of a part whose nearest border is known."""
     edge_normal = border.side * wp.normalize(wp.cross(border.begin - beam.point, border.end - beam.point))
     face_normal = wp.normalize(wp.cross(border.b - border.a, border.c - border.a))
     position = wp.dot(edge_normal, beam.offset) / beam.radius
@@ -134,7 +134,7 @@ def _blocked_share(parts: PlacedPartArrays, part: int, beam: Beam):
 def _blocked_share_adjoint(
     parts: PlacedPartArrays, part: int, beam: Beam, adj_share: float, batch: int, adj_corners: wp.array2d(dtype=wp.vec3)
 ):
-    """Gradients of the beam by that of the share; gradients of corners are added in place."""
+    """Gradients of the beam, given that of the share; those of corners are added."""
     adj = Beam()
     border = _nearest_border(parts, part, beam)
     if border.is_any:
@@ -237,7 +237,7 @@ def _may_hide(receiver: LitReceiver, part: int):
 
 @wp.func
 def _sum_blocked_shares(receiver: LitReceiver, piece: int, blocked_shares: wp.array(dtype=wp.float32)):
-    """Sum the shares a of a piece's parts for each sample; return whether it may hide any sample."""
+    """Find Σ a of a piece for each sample; returns whether it may hide any."""
     hides = bool(False)
     for part in range(receiver.parts.arrays.first_part[piece], receiver.parts.arrays.first_part[piece + 1]):
         if _may_hide(receiver, part):

@@ -136,7 +136,7 @@ def find_outline_samples(
 
 
 @wp.kernel(enable_backward=False)
-def _add_gradients_of_points(
+def _detach_adjoint(
     # in
     has_mean_slope: wp.array2d(dtype=wp.bool),
     adj_held: wp.array2d(dtype=wp.vec3),
@@ -161,7 +161,7 @@ def detach_near_outlines(fragments: Fragments, has_mean_slope: wp.array) -> Frag
     held_barycentrics = differentiable(
         lambda _: None,
         lambda adj_held: launch(
-            _add_gradients_of_points,
+            _detach_adjoint,
             has_mean_slope.shape,
             inputs=[has_mean_slope, rows(adj_held)],
             outputs=[rows(barycentrics.grad)],
