@@ -514,7 +514,7 @@ def eye_of(clip_matrix):
 
 
 def lobe_samples(points, normals, roughness, clip_matrix, count, spread=None, turns=0.0):
-    """Directions, (w, w', σ) and cosines of visible normals on a spiral over their cap (Dupuy and Benyoub 2023).
+    """Directions, (w, w'), σ and cosines of visible normals on a spiral over their cap (Dupuy and Benyoub 2023).
 
     A spread is (a, b), by which mirrors are wider; spirals are turned about the cap's axis.
     """
@@ -535,7 +535,7 @@ def lobe_samples(points, normals, roughness, clip_matrix, count, spread=None, tu
 
     local = np.stack([np.sqrt(1 - mu**2), 0 * mu, mu], axis=-1)
     slant, axis = np.linalg.norm(stretched(local), axis=-1), unit(stretched(local))
-    directions, weights = [], []
+    directions, weights, blurs = [], [], []
     for i in range(count):
         share, turn = (i + 0.5) / count, np.pi * (1 + np.sqrt(5)) * i + turns
         z = (1 - share) * (1 + axis[..., 2]) - axis[..., 2]
@@ -548,8 +548,9 @@ def lobe_samples(points, normals, roughness, clip_matrix, count, spread=None, tu
         flat = np.linalg.solve(width, mirror[..., :2, None])[..., 0]
         density = 1 / (np.pi * determinant * ((flat**2).sum(axis=-1) + mirror[..., 2] ** 2) ** 2) / (2 * (mu + slant))
         directions.append((frame @ to[..., None])[..., 0])
-        weights.append(np.stack([w, w * (1 - facing) ** 5, 1 / np.sqrt(2 * np.pi * count * density)], axis=-1))
-    return np.stack(directions, axis=-2), np.stack(weights, axis=-2), mu
+        weights.append(np.stack([w, w * (1 - facing) ** 5], axis=-1))
+        blurs.append(1 / np.sqrt(2 * np.pi * count * density))
+    return np.stack(directions, axis=-2), np.stack(weights, axis=-2), np.stack(blurs, axis=-1), mu
 
 
 def lobe_energy(cosine, roughness):

@@ -119,6 +119,17 @@ def a_dtype_says_of_what_its_items_are():
     assert warp_internals.scalar_type(wp.vec3i) is wp.int32
 
 
+@wp.struct
+class _Arrays:
+    colors: wp.array2d(dtype=wp.vec3)
+    indices: wp.array(dtype=wp.int32)
+
+
+def a_struct_says_of_what_its_arrays_are():
+    assert warp_internals.field_dtype(_Arrays, "colors") is wp.vec3
+    assert warp_internals.field_dtype(_Arrays, "indices") is wp.int32
+
+
 def views_know_that_they_are_views():
     whole = wp.zeros((4, 2), dtype=wp.float32, device="cpu")
     assert warp_internals.viewed_array(whole) is None
@@ -166,6 +177,7 @@ def check(works):
         a_module_that_was_unloaded_is_loaded_again,
         arguments_of_a_wrong_type_are_refused,
         a_dtype_says_of_what_its_items_are,
+        a_struct_says_of_what_its_arrays_are,
         views_know_that_they_are_views,
         modules_list_their_kernels,
         pytest.param(a_module_that_two_processes_need_is_compiled_once, marks=pytest.mark.slow),

@@ -492,6 +492,7 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
         "stages.raster.sides": "sides",
         "stages.receivers.find": "receivers",
         "stages.light.shading": "shading",
+        "stages.image.outlines": "radiance",
         "stages.image.slopes": "radiance",
     }[module]
 

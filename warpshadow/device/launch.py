@@ -14,7 +14,7 @@ import warp as wp
 
 from warpshadow.device import warp_internals
 from warpshadow.device.memory import in_huge_pages, require_gradient
-from warpshadow.device.parallel import Scratch, launch_adjoint_slices, launch_slices
+from warpshadow.device.parallel import Scratch, ScratchStruct, launch_adjoint_slices, launch_slices
 from warpshadow.device.tape import record_adjoint, record_kernel
 from warpshadow.device.warp_internals import contiguous_view, scalar_type, viewed_array
 
@@ -26,7 +26,7 @@ def launch(
     inputs: Sequence[Any],
     outputs: Sequence[wp.array | None] = (),
     sums: Sequence[wp.array | None] = (),
-    scratch: Sequence[Scratch] = (),
+    scratch: Sequence[Scratch | ScratchStruct] = (),
     cost: float | None = None,
     shared: Sequence[wp.array | None] = (),
 ) -> None:
@@ -107,8 +107,8 @@ def launch_with_adjoint(
     shared: Sequence[wp.array | None] = (),
     outputs: Sequence[wp.array] = (),
     adj_inputs: Sequence[wp.array] = (),
-    scratch: Sequence[Scratch] = (),
-    adj_scratch: Sequence[Scratch] = (),
+    scratch: Sequence[Scratch | ScratchStruct] = (),
+    adj_scratch: Sequence[Scratch | ScratchStruct] = (),
     cost: float,
     adj_cost: float | None = None,
 ) -> wp.array:

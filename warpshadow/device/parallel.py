@@ -19,7 +19,7 @@ import math
 import os
 import queue
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -112,6 +112,24 @@ class Scratch(NamedTuple):
     shape: tuple[int, ...]
     dtype: type
 
+    def allocate(self, rows: int, device: wp.Device) -> wp.array:
+        """Make the array."""
+        return empty((rows, *self.shape), self.dtype, device)
+
+
+class ScratchStruct(NamedTuple):
+    """Scratch memory of a kernel whose arrays are the fields of a struct: of each the shape of a thread's row."""
+
+    struct: Any
+    shapes: Mapping[str, tuple[int, ...]]
+
+    def allocate(self, rows: int, device: wp.Device) -> Any:
+        """Make the struct with its arrays."""
+        scratch = self.struct()
+        for field, shape in self.shapes.items():
+            setattr(scratch, field, empty((rows, *shape), warp_internals.field_dtype(self.struct, field), device))
+        return scratch
+
 
 def run_length(device: wp.Device, width: int) -> int:
     """Consecutive samples that a thread owns: on a CPU a row, since starting a thread costs as much as some samples."""
@@ -148,7 +166,7 @@ def launch_slices(
     cost: float,
     inputs: Sequence[Any],
     outputs: Sequence[wp.array | None],
-    scratch: Sequence[Scratch] = (),
+    scratch: Sequence[Scratch | ScratchStruct] = (),
     sums: Sequence[wp.array | None] = (),
     device: wp.Device,
 ) -> None:
@@ -156,7 +174,7 @@ def launch_slices(
     dim = _shape(dim)
     slice_count, workers = _count_slices(dim, cost, sums, device)
     rows = min(workers, slice_count) if device.is_cpu else math.prod(dim)
-    arguments = [*inputs, *(empty((rows, *shape), dtype, device) for shape, dtype in scratch), *outputs]
+    arguments = [*inputs, *(memory.allocate(rows, device) for memory in scratch), *outputs]
     summed_arguments = {index: array for index, array in enumerate(sums, 2 + len(arguments)) if array is not None}
     _launch_slices(kernel, dim, [*arguments, *sums], summed_arguments, None, slice_count, workers, device)
 

@@ -373,6 +373,11 @@ def scalar_type(dtype: type) -> type:
     return getattr(dtype, "_wp_scalar_type_", dtype)
 
 
+def field_dtype(struct: Any, field: str) -> type:
+    """Type of the items of an array that is a field of a struct."""
+    return struct.vars[field].type.dtype
+
+
 def viewed_array(array: wp.array) -> wp.array | None:
     """The array that another views, as a part of it or in another shape; None for an array with memory of its own."""
     return getattr(array, "_ref", None)

@@ -53,6 +53,7 @@ def _hull(points: np.ndarray, corners: np.ndarray) -> ConvexPart:
     triangles = np.where(is_inward, hull.simplices[:, ::-1], hull.simplices)
     neighbors = np.where(is_inward, hull.neighbors[:, ::-1], hull.neighbors)  # opposite to each corner
     face = np.unique(hull.equations, axis=0, return_inverse=True)[1].reshape(-1)
+    # the largest triangle of each face, whose corners describe its plane best
     largest = np.lexsort((np.linalg.norm(normals, axis=1), face))[np.cumsum(np.bincount(face)) - 1]
     triangle, opposite = np.nonzero(face[:, None] < face[neighbors])
     ends = triangles[triangle[:, None], (opposite[:, None] + [1, 2]) % 3]

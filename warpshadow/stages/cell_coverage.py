@@ -46,7 +46,7 @@ class ViewedEdge:
 
 @wp.func
 def viewed_edge(begin: wp.vec3, end: wp.vec3, n: wp.vec3):
-    """An edge between two points relative to the receiver, by a normal of any length but 0 towards the shape."""
+    """Edge between two points relative to the receiver; the normal points to the shape, of any length but 0."""
     edge = ViewedEdge()
     edge.length = wp.length(n)
     edge.normal = (1.0 / edge.length) * n
@@ -57,7 +57,7 @@ def viewed_edge(begin: wp.vec3, end: wp.vec3, n: wp.vec3):
 
 @wp.struct
 class Chord:
-    """Part of an edge that is seen within a cell, in the plane that touches the sphere of directions there."""
+    """Part of an edge within a cell, in the tangent plane of the sphere of directions there."""
 
     distance: float  # d, of the line from the middle of the cell
     begin: float  # s₀
@@ -137,7 +137,7 @@ def _coverage_within_edges(
 
 @wp.func
 def _with_cell_share(coverage: wp.vec4, cell_share: float):
-    """A coverage with another share, of 0 to 1, and the same moment."""
+    """The coverage with its share replaced, clamped to [0, 1]."""
     return wp.vec4(wp.clamp(cell_share, 0.0, 1.0), coverage[1], coverage[2], coverage[3])
 
 

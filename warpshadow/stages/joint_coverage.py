@@ -29,7 +29,9 @@ from warpshadow.device.parallel import split_row
 MIN_BOUNDS = wp.constant(1.0e-6)
 """Σ ν ν below which blockers count as independent: such a product is of the size of its rounding."""
 
-MOMENT_BOUND = wp.constant(wp.vec3(0.96935, -0.81588, 1.36307))  # ν(h) by powers of h (1 − h), from the first on
+MOMENT_BOUND = wp.constant(wp.vec3(0.96935, -0.81588, 1.36307))
+"""ν(h) by powers of h (1 − h), from the first on, fitted to within 0.0005: a half-plane at d from the middle of a disc of
+radius 1 covers h = (acos d − d √(1 − d²)) / π, with the moment 2 (1 − d²)^(3/2) / 3π."""
 
 _PASS_COST = 1.0  # time of a cell [ns]
 
@@ -59,7 +61,7 @@ def _open_share(coverage: wp.vec4, other: wp.vec4):
 
 @wp.func
 def _is_partial(coverage: wp.vec4):
-    """Whether a blocker covers a cell in part; else it has no gradient."""
+    """Whether a blocker covers a part of a cell only; other coverage has no gradient."""
     return coverage[0] > 0.0 and coverage[0] < 1.0
 
 

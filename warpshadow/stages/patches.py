@@ -274,7 +274,7 @@ class _PieceMesh(NamedTuple):
 
 
 def _area_vectors(corners: np.ndarray) -> np.ndarray:
-    """Normals of triangles, as long as their areas are large."""
+    """Normals of triangles, as long as their areas."""
     return area_normals(corners) / 2
 
 
@@ -324,7 +324,7 @@ def _bounding_spheres(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _find_outside(mesh: wp.Mesh, corners: np.ndarray, lift: float) -> tuple[np.ndarray, np.ndarray]:
-    """Find pieces outside of all parts of their body, and pieces inside that reach out.
+    """Find the pieces outside all parts of their body, and those inside that reach out of it.
 
     Args:
         mesh: The body, of parts that are closed.

@@ -314,9 +314,9 @@ class _WarpAdjoint(torch.autograd.Function):
 
 
 def current_stream(device: torch.device) -> wp.ScopedStream:
-    """Launch on torch's current stream, which while it is captured must not wait for streams that are not.
+    """Launch on torch's current stream; Warp's own then waits for it, since Warp frees memory there.
 
-    Else Warp's stream waits for it at the end: there Warp frees memory that has no reference left.
+    While a stream is captured neither waits: it may not depend on one that is not captured.
     """
     is_cuda = device.type == "cuda"
     stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if is_cuda else None

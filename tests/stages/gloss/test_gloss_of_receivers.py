@@ -32,11 +32,11 @@ def receivers(count=9, seed=0):
 
 
 def arrays(device, *values, requires_grad=False):
-    dtypes = {(1, 4, 4): wp.mat44}
+    dtypes, vectors = {(1, 4, 4): wp.mat44}, {2: wp.vec2, 3: wp.vec3}
     return [
         wp.array(
             value.astype(np.float32),
-            dtype=dtypes.get(value.shape, wp.vec3 if value.shape[-1] == 3 else wp.float32),
+            dtype=dtypes.get(value.shape, vectors.get(value.shape[-1], wp.float32)),
             device=device,
             requires_grad=requires_grad,
         )
@@ -64,7 +64,7 @@ def test_samples_of_lobes_are_those_of_the_twin(device, varies):
     arguments = arrays(device, points, normals, roughness, CAMERA[None])
     got = lobes.sample_lobes(*arguments, 32, NormalSpread(*arrays(device, *spread)) if varies else None)
     expected_samples = twins.lobe_samples(points, normals, roughness, CAMERA, 32, spread)
-    for result, expected in zip(got[:3], expected_samples, strict=True):
+    for result, expected in zip(got[:4], expected_samples, strict=True):
         assert np.abs(result.numpy() - expected).max() < 20 * FLOAT32 * np.abs(expected).max()
 
 
@@ -73,8 +73,8 @@ def test_samples_of_lobes_are_turned_by_the_places_of_receivers_in_pixels(device
     places, turns = places_of(points, device)
     got = lobes.sample_lobes(*arrays(device, points, normals, roughness, CAMERA[None]), 8, None, places, 4)
     expected_samples = twins.lobe_samples(points, normals, roughness, CAMERA, 8, None, turns)
-    expected_samples[1][..., 2] *= 4**-0.2  # narrower blur
-    for result, expected in zip(got[:3], expected_samples, strict=True):
+    expected_samples[2][:] *= 4**-0.2  # narrower blur
+    for result, expected in zip(got[:4], expected_samples, strict=True):
         assert np.abs(result.numpy() - expected).max() < 20 * FLOAT32 * np.abs(expected).max()
 
 
@@ -88,14 +88,14 @@ def test_samples_of_lobes_have_the_gradients_of_the_twin(device, count, is_turne
     places, turns = places_of(points, device) if is_turned else (None, 0.0)
     with wp.Tape() as tape:
         samples = lobes.sample_lobes(*variables[:4], count, NormalSpread(*variables[4:]), places, 4 if is_turned else 1)
-    samples = samples[:3]
-    weights = [rng.normal(size=result.shape + (3,) * (result.dtype == wp.vec3)) for result in samples]
+    samples = samples[:4]
+    weights = [rng.normal(size=result.numpy().shape) for result in samples]
     tape.backward(grads=dict(zip(samples, arrays(device, *weights), strict=True)))
 
     def loss(values):
         results = twins.lobe_samples(*values[:3], values[3][0], count, values[4:], turns)
         if is_turned:
-            results[1][..., 2] *= 4**-0.2
+            results[2][:] *= 4**-0.2
         return sum((weight * result).sum() for weight, result in zip(weights, results, strict=True))
 
     for number, variable in enumerate(variables):
@@ -155,13 +155,13 @@ def test_samples_that_leave_below_their_face_have_no_weight(device):
     face_normal = twins.unit(np.cross(corners[1] - corners[0], corners[2] - corners[0]))
     side = np.array([1.0, -1.0, 1.0])[:, None]
     normals = twins.unit(side * face_normal + 0.5 * rng.normal(size=3))
-    directions, filters = twins.unit(side[:, None] * face_normal + rng.normal(size=(3, 32, 3))), rng.random((3, 32, 3))
+    directions, weights = twins.unit(side[:, None] * face_normal + rng.normal(size=(3, 32, 3))), rng.random((3, 32, 2))
     fragments = Fragments(wp.array([[0, 0, -1]], dtype=wp.int32, device=device), wp.empty((1, 3), wp.vec3, device))
     faces = wp.array([[0, 1, 2]], dtype=wp.vec3i, device=device)
-    inputs = arrays(device, corners[None], normals[None], directions[None], filters[None])
+    inputs = arrays(device, corners[None], normals[None], directions[None], weights[None])
     heights = np.clip(1 + side * (directions @ face_normal) / 0.1, 0, 1)
     heights[2] = 1
-    expected = filters * np.stack([heights**2 * (3 - 2 * heights)] * 2 + [np.ones_like(heights)], axis=-1)
+    expected = weights * (heights**2 * (3 - 2 * heights))[..., None]
     assert ((heights > 0) & (heights < 1)).any() and (heights[:2] == 0).any()
     assert np.abs(weigh_by_faces(fragments, faces, *inputs).numpy()[0] - expected).max() < 20 * FLOAT32
 
@@ -173,8 +173,8 @@ def test_lobes_take_as_much_even_light_as_the_surface_reflects(device, roughness
     normal = np.array([0.0, 0.0, 1.0])
     point = twins.eye_of(CAMERA) - 2 * np.array([np.sqrt(1 - cosine**2), 0, cosine])
     values = point[None, None], normal[None, None], np.array([[roughness]]), CAMERA[None]
-    _, filters, *_ = lobes.sample_lobes(*arrays(device, *values), 32)
-    got = filters.numpy()[0, 0].sum(axis=0)
+    _, weights, *_ = lobes.sample_lobes(*arrays(device, *values), 32)
+    got = weights.numpy()[0, 0].sum(axis=0)
     for part, expected in zip(got, twins.lobe_energy(cosine, roughness), strict=False):
         assert part == pytest.approx(expected, abs=ENERGY)
 
@@ -196,9 +196,8 @@ def test_prefiltered_light_is_blurred_by_gaussians(device):
     texels = wp.array(prefilter.prefilter(radiance)[None], dtype=wp.vec3, device=device)
     directions = fibonacci(16).astype(np.float32)[None]
     for sigma in (0.1, 0.4):
-        filters = np.zeros((1, 1, 16, 3), np.float32)
-        filters[..., 2] = sigma
-        inputs = [wp.array(value, dtype=wp.vec3, device=device) for value in (directions[None], filters)]
+        blurs = wp.full((1, 1, 16), sigma, dtype=wp.float32, device=device)
+        inputs = wp.array(directions[None], dtype=wp.vec3, device=device), blurs
         expected = twins.blurred(radiance, directions[0], sigma)
         got = prefilter.look_up_light(texels, *inputs).numpy()[0, 0]
         # texels are as wide as the Gaussian, and levels interpolate: measured 10%
@@ -208,8 +207,8 @@ def test_prefiltered_light_is_blurred_by_gaussians(device):
 def test_even_light_stays_as_it_is_at_any_level(device):
     texels = wp.array(prefilter.prefilter(np.full((8, 16, 3), 0.7))[None], dtype=wp.vec3, device=device)
     directions = wp.array(fibonacci(16)[None, None], dtype=wp.vec3, device=device)
-    filters = wp.array(np.linspace(0, 1.5, 48).reshape(1, 1, 16, 3), dtype=wp.vec3, device=device)
-    assert np.abs(prefilter.look_up_light(texels, directions, filters).numpy() - 0.7).max() < FLOAT32
+    blurs = wp.array(np.linspace(0, 1.5, 16)[None, None], dtype=wp.float32, device=device)
+    assert np.abs(prefilter.look_up_light(texels, directions, blurs).numpy() - 0.7).max() < FLOAT32
 
 
 def test_maps_keep_their_energy_with_other_rows():
@@ -244,10 +243,10 @@ def test_blockers_send_what_is_blocked(device):
     openness = wp.array([[[0.5] * 3, [1.0] * 3]], dtype=wp.vec3, device=device)
     blocked = reflection.find_blocked_radiance(even, direct, openness)
     np.testing.assert_allclose(blocked.numpy()[0], [[0.7] * 3, [0.0] * 3], rtol=1e-6)
-    filters = wp.full((1, 2, 4), wp.vec3(0.25), dtype=wp.vec3, device=device)
+    weights = wp.full((1, 2, 4), wp.vec2(0.25), dtype=wp.vec2, device=device)
     light = wp.full((1, 2, 4), wp.vec3(0.7), dtype=wp.vec3, device=device)
     through = wp.array(np.linspace(0, 1, 8).reshape(1, 2, 4), dtype=wp.float32, device=device)
-    for total in reflection.sum_lobes(filters, light, through, blocked):
+    for total in reflection.sum_lobes(weights, light, through, blocked):
         np.testing.assert_allclose(total.numpy()[0, 0], 0.7, rtol=1e-6)
 
 

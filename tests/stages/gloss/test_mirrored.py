@@ -68,10 +68,10 @@ def test_nothing_is_traced_towards_open_sky(device):
 
 def mixed(device, hits, faces, *arrays, radiosity=None):
     """M of all samples, of a light that is the mirrored direction and its blur."""
-    roughness, directions, filters, albedo, metallic, mean, through = arrays
-    towards = mirrored.mirror(hits, faces, roughness, directions, filters)
+    roughness, directions, blurs, albedo, metallic, mean, through = arrays
+    towards = mirrored.mirror(hits, faces, roughness, directions, blurs)
     light = towards.directions, mean, through, radiosity
-    return mirrored.mix_mirrored(hits, faces, albedo, metallic, towards.filters, *light), towards
+    return mirrored.mix_mirrored(hits, faces, albedo, metallic, towards.fresnel_weights, *light), towards
 
 
 def inputs_of(device):
@@ -79,7 +79,7 @@ def inputs_of(device):
     values = [
         (rng.uniform(0.2, 0.6, (1, 8)), wp.float32),
         (DIRECTIONS[None], wp.vec3),
-        (rng.uniform(0.1, 0.3, (1, 2, 3, 3)), wp.vec3),
+        (rng.uniform(0.1, 0.3, (1, 2, 3)), wp.float32),
         (rng.uniform(0.2, 0.9, (1, 8, 3)), wp.vec3),
         (rng.uniform(0.3, 0.9, (1, 8)), wp.float32),
         (rng.uniform(0.2, 0.9, (1, 2, 3)), wp.vec3),
@@ -97,14 +97,15 @@ def test_metals_send_the_light_that_they_mirror_in_their_color(device):
     arrays = inputs_of(device)
     radiance, towards = mixed(device, batched(hits), faces, *arrays)
     meets, normals, is_open, expected_towards, _ = expected_hits()
-    roughness, _, filters, albedo, metallic, mean, through = (array.numpy()[0] for array in arrays)
+    roughness, _, blurs, albedo, metallic, mean, through = (array.numpy()[0] for array in arrays)
     weights, corners = hits.barycentrics.numpy()[meets], faces.numpy()[hits.face_ids.numpy()[meets]]
     rough, color, share = (
         np.einsum("hc,hc...->h...", weights, values[corners]) for values in (roughness, albedo, metallic)
     )
     grazing = (1 - np.abs((DIRECTIONS * normals).sum(axis=-1)[meets])) ** 5
-    blur = np.sqrt(filters[..., 2][meets] ** 2 + 2 * rough**4)
-    np.testing.assert_allclose(towards.filters.numpy()[0][meets], np.stack([grazing, 0 * blur, blur], 1), rtol=1e-4)
+    blur = np.sqrt(blurs[meets] ** 2 + 2 * rough**4)
+    np.testing.assert_allclose(towards.fresnel_weights.numpy()[0][meets], grazing, rtol=1e-4)
+    np.testing.assert_allclose(towards.blurs.numpy()[0][meets], blur, rtol=1e-4)
     np.testing.assert_allclose(towards.directions.numpy()[0][meets], expected_towards[meets], atol=FLOAT32)
     of_receivers = np.broadcast_to(mean[:, None], (2, 3, 3))
     seen = np.where(is_open[meets][:, None], expected_towards[meets], of_receivers[meets])

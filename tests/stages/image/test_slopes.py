@@ -9,14 +9,8 @@ from scipy import ndimage
 import warpshadow as ws
 from warpshadow.maths.adjacency import edge_neighbors
 from warpshadow.stages.image.film import sample_radiance
-from warpshadow.stages.image.slopes import (
-    MIN_DISTANCE,
-    MIN_WEIGHT,
-    REACH,
-    detach_near_outlines,
-    find_outline_samples,
-    moving_radiance,
-)
+from warpshadow.stages.image.outlines import MIN_DISTANCE, REACH, detach_near_outlines, find_outline_samples
+from warpshadow.stages.image.slopes import MIN_WEIGHT, moving_radiance
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.rasterization import rasterize
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors

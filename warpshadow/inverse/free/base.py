@@ -81,7 +81,7 @@ class Free(abc.ABC):
         return
 
     def beside(self, others: Sequence[Free]) -> Free:
-        """The parameter as it is beside all that are free, itself among them; ValueError where it cannot be."""
+        """Adapt the parameter to all free ones, itself among them; ValueError where it cannot be free beside them."""
         return self
 
     @abc.abstractmethod

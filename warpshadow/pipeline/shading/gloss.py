@@ -70,10 +70,10 @@ def mix_gloss(
         return Node("lobes", functools.partial(_sample_lobes, method), *inputs, items=item_text)
 
     samples = points.cached("lobes", materials.roughness, sample)
-    directions, filters = field_of(samples, "directions"), field_of(samples, "filters")
+    directions, weights, blurs = (field_of(samples, name) for name in ("directions", "weights", "blurs"))
     texels = _prefiltered(method, points, light)
     starts = field_of(points.receivers_node, "points")
-    radiance = _look_up(method, points, "prefiltered light", light, texels, directions, filters, starts)
+    radiance = _look_up(method, points, "prefiltered light", light, texels, directions, blurs, starts)
     transmittance = visibility.transmittance(lobes, directions)
     mirrored: Node | None = None
     mirrored_bodies = method.mirrored_bodies
@@ -84,7 +84,7 @@ def mix_gloss(
         mirrored = mirrored_bodies.radiance(
             shown, points, light, materials, samples, transmittance, blocked, look_up, radiosity
         )
-    lobe_light = Node("gloss", sum_lobes, filters, radiance, transmittance, blocked, mirrored, items=item_text)
+    lobe_light = Node("gloss", sum_lobes, weights, radiance, transmittance, blocked, mirrored, items=item_text)
     suns = visibility.suns(points, light)
     if suns is not None:
         sun_transmittance = visibility.sun_transmittance(lobes, suns)
@@ -106,7 +106,7 @@ def _look_up(
     light: LightInput,
     texels: Node,
     directions: Node,
-    filters: Node,
+    blurs: Node,
     starts: Node,
 ) -> Node:
     """Node of light without shadows along rays from ``starts``, vec3 of shape [batch, receiver, sample]."""
@@ -114,7 +114,7 @@ def _look_up(
     if shell is not None:
         directions = Node("", exits_from_shell, starts, directions, shell)
     return Node(
-        name, look_up_light, texels, directions, filters, items=functools.partial(receiver_text, points.weak_reference)
+        name, look_up_light, texels, directions, blurs, items=functools.partial(receiver_text, points.weak_reference)
     )
 
 
@@ -173,7 +173,7 @@ def _sample_lobes(
     samples, fragments = sample_lobes(*arguments, spread, places, receivers_across**2), receivers.sample_fragments
     assert fragments is not None
     above = fragments, method.merged_scene.side_faces, positions, receivers.normals
-    return samples._replace(filters=weigh_by_faces(*above, samples.directions, samples.filters))
+    return samples._replace(weights=weigh_by_faces(*above, samples.directions, samples.weights))
 
 
 def _sample_textures(

@@ -81,11 +81,11 @@ class MirroredBodies:
             samples: Node of the samples of lobes, cached for a roughness.
             transmittance: Node of the samples' transmittance.
             mean_radiance: Node of the mean radiance of each receiver's blockers.
-            look_up: Makes the node of light without shadows, of nodes of directions, filters, and where these rays
+            look_up: Makes the node of light without shadows, of nodes of directions, blurs, and where these rays
                 start.
             radiosity: Node of that of the sides of faces, vec3 of shape [batch, 2 · face]; None for none.
         """
-        faces, filters = self._merged_scene.side_faces, field_of(samples, "filters")
+        faces, blurs = self._merged_scene.side_faces, field_of(samples, "blurs")
         directions, transmittance = (
             Node("", without_gradient, node) for node in (field_of(samples, "directions"), transmittance)
         )
@@ -98,10 +98,12 @@ class MirroredBodies:
 
         hits = points.cached("hits", (samples, light.visibility_key, shown), trace)
         roughness, albedo, metallic = (materials.of_vertices(name) for name in ("roughness", "albedo", "metallic"))
-        mirrored = Node("", mirror, hits, faces, roughness, directions, filters)
-        filters = field_of(mirrored, "filters")
-        mirrored_light = look_up(field_of(mirrored, "directions"), filters, field_of(hits, "points"))
-        inputs = faces, albedo, metallic, filters, mirrored_light, mean_radiance, transmittance, radiosity
+        mirrored = Node("", mirror, hits, faces, roughness, directions, blurs)
+        directions, fresnel_weights, blurs = (
+            field_of(mirrored, name) for name in ("directions", "fresnel_weights", "blurs")
+        )
+        mirrored_light = look_up(directions, blurs, field_of(hits, "points"))
+        inputs = faces, albedo, metallic, fresnel_weights, mirrored_light, mean_radiance, transmittance, radiosity
         return Node("light of mirrored bodies", mix_mirrored, hits, *inputs)
 
     def _find_hits(

@@ -12,7 +12,7 @@ from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
 from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.method import Method
-from warpshadow.stages.image.slopes import find_outline_samples
+from warpshadow.stages.image.outlines import find_outline_samples
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
 from warpshadow.stages.receivers.receiver_footprints import FootprintInputs

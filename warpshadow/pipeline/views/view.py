@@ -17,7 +17,8 @@ from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.receiver_finder import ReceiverFinder
 from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.image.film import average, sample_radiance, sum_radiance
-from warpshadow.stages.image.slopes import detach_near_outlines, find_outline_samples, moving_radiance
+from warpshadow.stages.image.outlines import detach_near_outlines, find_outline_samples
+from warpshadow.stages.image.slopes import moving_radiance
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.rasterization import Fragments, rasterize

@@ -76,7 +76,7 @@ def _piece_areas(patches: Patches, positions: np.ndarray, faces: np.ndarray) -> 
 def _mean(
     patches: Patches, areas: np.ndarray, columns: np.ndarray, weights: np.ndarray, column_count: int
 ) -> csr_matrix:
-    """Means by area over pieces [piece] of their weights of columns [piece, n]."""
+    """Matrix of the means over patches, by area, of the columns and weights [piece, n] of their pieces."""
     from scipy.sparse import csr_matrix
 
     entry_weights = areas[:, None] * weights

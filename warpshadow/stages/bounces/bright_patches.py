@@ -20,7 +20,7 @@ _BRIGHT = 8.0  # radiosity from which a patch is bright, in means of the scene: 
 
 @wp.struct
 class BrightPatches:
-    """Sides of a mesh that rays are sent to."""
+    """Sides of a mesh that get rays of their own."""
 
     sides: wp.array(dtype=wp.int32)  # face, or face count + face for its back, [bright side]
     distribution: wp.array(dtype=wp.float32)  # sums of their probabilities, [bright side]
@@ -88,7 +88,7 @@ def hit_weight(
     ray_direction: wp.vec3,
     ray_count: int,
 ):
-    """How much a ray counts that meets a patch, where one to another patch counts 1: N g / (N g + q)."""
+    """Weight of a ray that meets a patch, N g / (N g + q); 1 if the patch is not bright."""
     if bright.ray_count == 0:
         return 1.0
     density = bright.density[patch]

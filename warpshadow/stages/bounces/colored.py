@@ -29,7 +29,7 @@ class ColoredTransfer:
 
     @staticmethod
     def from_lit_receivers(lit_receivers: np.ndarray, *, device: wp.DeviceLike) -> ColoredTransfer:
-        """Transfer from the light on receivers under each coefficient alone, float32 [coefficient, receiver, 3]."""
+        """Make it of the light that each coefficient alone sends to receivers, float32 [coefficient, receiver, 3]."""
         columns = wp.array(lit_receivers, dtype=wp.vec3, device=device)
         return ColoredTransfer(wp.array(lit_receivers.swapaxes(0, 1), dtype=wp.vec3, device=device), columns)
 

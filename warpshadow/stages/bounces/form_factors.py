@@ -127,7 +127,7 @@ def _lattice(ray_count: int) -> np.ndarray:
 
 
 def patch_mesh(patches: Patches, positions: np.ndarray, faces: np.ndarray, *, device: wp.DeviceLike) -> wp.Mesh:
-    """Make the mesh of the pieces of a body, for rays: its face is a piece.
+    """Make a mesh for rays, with a face for each piece of a body.
 
     Args:
         positions, faces: The mesh that they are pieces of, NumPy.
@@ -245,7 +245,7 @@ def scale_rows(matrix: csr_matrix, factors: np.ndarray) -> csr_matrix:
 
 
 def mean_outside(means: csr_matrix, is_buried: np.ndarray) -> csr_matrix:
-    """Means over items that are not buried, [row, item]; as they were where all are."""
+    """Means over the items of each row that are not buried, [row, item]; over all items of a row that is all buried."""
     open_means = scale_rows(means.T, (~is_buried).astype(np.float32)).T.tocsr()
     target, open_sums = (np.asarray(item.sum(axis=1)).ravel() for item in (means, open_means))
     return scale_rows(open_means, scaling_factors(target, open_sums)) + scale_rows(

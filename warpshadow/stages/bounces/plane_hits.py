@@ -87,7 +87,7 @@ def hit_scratch(planes: PlaneBlockers) -> Scratch:
 
 @wp.func
 def is_hit(hits: wp.array(dtype=PlaneHit), i: int):
-    """Whether side i covers a part of the cell; if not, all else in its hit is old."""
+    """Whether side i covers a part of the cell; else other fields of its hit are of another cell."""
     return hits[i].coverage > 0.0
 
 
@@ -121,7 +121,7 @@ def _is_sender(side: PlaneSide):
 
 @wp.struct
 class _Overlap:
-    """Which of two sides is in front where both cover a cell."""
+    """The order of two sides in the part of a cell that both cover."""
 
     difference: wp.vec3  # g_j − g_k
     central_difference: float  # of inverse distances in the middle of the cell
@@ -152,7 +152,7 @@ def _find_overlap(cell: VisibleCell, hit: PlaneHit, other: PlaneHit):
 
 @wp.func
 def _block_each_other(cell: VisibleCell, k: int, j: int, hits: wp.array(dtype=PlaneHit)):
-    """Take from each of two hits the part that the other blocks."""
+    """Subtract from each of two hits the part that the other blocks."""
     hit, other = hits[k], hits[j]
     share_in_front = wp.smoothstep(-1.0, 1.0, _find_overlap(cell, hit, other).relative)
     by_other = share_in_front * other.coverage

@@ -161,7 +161,7 @@ def _project(
 
 @cached_by_values
 def _directions_and_opposites(directions: np.ndarray, device: wp.Device) -> tuple[wp.array, wp.array]:
-    """Directions of cells, and the cell that is nearest to the opposite of each."""
+    """Directions of cells, and for each the cell nearest to its opposite."""
     check_directions(directions)
     opposite = (-directions @ directions.T).argmax(axis=1).astype(np.int32)
     return constant(directions, wp.vec3, device), constant(opposite, wp.int32, device)

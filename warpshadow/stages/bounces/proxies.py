@@ -31,7 +31,7 @@ _ABOVE = 0.1  # how far above a patch the other side may lie, in radii: patches 
 
 
 def find_depths(centers: np.ndarray, normals: np.ndarray, areas: np.ndarray) -> np.ndarray:
-    """Find how far below each patch of a body its proxy is, in radii: less where the body is thinner than the proxy.
+    """Find the depth of proxies below their patches, in radii: less where the body is thinner than the proxy.
 
     Args:
         centers, normals, areas: Of the patches [units of the body], shapes [patch, 3], [patch, 3] and [patch].

@@ -30,7 +30,7 @@ _TINY = 1.0e-18  # distance that has a derivative
 
 @wp.struct
 class WeightInputs:
-    """The weights of proxies depend on these, and on receivers, centers and radii."""
+    """Inputs of the weights of proxies, beside receivers, centers and radii."""
 
     inverse_size: float  # 1/s
     equations: wp.array(dtype=wp.vec4)  # [proxy] of tangent planes; none where all receivers are above them
@@ -56,7 +56,7 @@ def make_weight_functions(lanes: int) -> WeightFunctions:
 
     @wp.func(inline=True)
     def find_nearness(offset: Vectors, curvature: float, inverse_size: float):
-        """√(w/f)."""
+        """√(w/f), the root of a proxy's weight w without the factor f of its tangent plane."""
         scaled_offset = scale(Lane(inverse_size), offset)
         core_radius = CORE * inverse_size / curvature
         return wp.cw_div(
@@ -65,13 +65,13 @@ def make_weight_functions(lanes: int) -> WeightFunctions:
 
     @wp.func(inline=True)
     def find_height(offset: Vectors, equation: wp.vec4, tolerance: wp.vec2):
-        """How far receivers are above the tangent plane, d sin σ added."""
+        """Heights of receivers above the tangent plane, plus d sin σ."""
         normal = wp.vec3(equation[0], equation[1], equation[2])
         return tolerance[0] * sqrt(dot(offset, offset)) - dot_direction(normal, offset) - Lane(equation[3])
 
     @wp.func(inline=True)
     def find_facing(offset: Vectors, curvature: float, equation: wp.vec4, tolerance: wp.vec2):
-        """Argument of the smoothstep, and f."""
+        """The factor f of the tangent plane, after the argument of its smoothstep."""
         x = (tolerance[1] * curvature) * find_height(offset, equation, tolerance)
         x = wp.min(wp.max(x, Lane(0.0)), Lane(1.0))
         return x, Lane(HIDDEN) + (1.0 - HIDDEN) * wp.cw_mul(wp.cw_mul(x, x), Lane(3.0) - 2.0 * x)

@@ -55,7 +55,7 @@ def self_light(
     body_spans: Sequence[Span] = (),
     first_probes: Sequence[int] = (0,),
 ) -> wp.array:
-    """Light that receivers get from their own body, added to other light; it does not depend on the pose.
+    """Add the light from the receivers' own body, which does not depend on its pose, to other light.
 
         I_x = c_x + Σ_k w_xk Σ_p F_(row k of x)p B_p
 

@@ -111,7 +111,7 @@ def _make_load_task(lanes: int) -> wp.Function:
 
     @wp.func(inline=True)
     def load_blocked(block: ReceiverBlock, bundle: int, inputs: LightInputs, task: LightTask):
-        """Load F − T of a bundle's cells; returns whether it is not 0 anywhere."""
+        """Load F − T of a bundle's cells; return whether light of any cell is blocked."""
         first_slot = bundle * BUNDLE
         first_direction = (task.first_bundle + bundle) * BUNDLE
         rows = inputs.transmittance[block.batch][block.first : block.end]
@@ -322,7 +322,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
 
     @wp.func(inline=True)
     def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: LightTask):
-        """Of the cone, and of the weight w, whose w̄ w is Σ ā a."""
+        """Add to the gradients of a proxy by its cone, and by its weight w, of which w̄ w = Σ ā a."""
         adj_sphere, relative_adjoint = cap_adjoint(receivers, sphere_view, count, task)
         if adj_sphere.is_any:
             adj_offset, adj_radius = weight_adjoint(

@@ -47,7 +47,7 @@ def _bounce_terms(
     radiosity_3: wp.array2d(dtype=wp.vec3),
     radiosity_4: wp.array2d(dtype=wp.vec3),
 ):
-    """D_1 to D_4 of a patch in a color."""
+    """The terms D_1 to D_4 of a patch, for one color."""
     b0 = wp.float64(radiosity_0[instance_in(batch, radiosity_0.shape[0]), patch][color])
     b1 = wp.float64(radiosity_1[instance_in(batch, radiosity_1.shape[0]), patch][color])
     b2 = wp.float64(radiosity_2[instance_in(batch, radiosity_2.shape[0]), patch][color])
@@ -117,7 +117,7 @@ def _solve(
 
 @wp.func
 def _tail_of_color(terms: wp.vec4d, coefficients: wp.vec3d):
-    """Σ c_j D_(j+1)."""
+    """Extrapolated rest Σ c_j D_(j+1) of the series of a color."""
     return wp.float32(coefficients[0] * terms[1] + coefficients[1] * terms[2] + coefficients[2] * terms[3])
 
 

@@ -161,7 +161,7 @@ def _starts(counts: Sequence[int]) -> np.ndarray:
 
 
 def _selection_matrix(columns: np.ndarray, count: int) -> csr_matrix:
-    """The matrix that chooses some of so many items."""
+    """Matrix that selects some of ``count`` items."""
     from scipy.sparse import csr_matrix
 
     return csr_matrix((np.ones(len(columns)), (np.arange(len(columns)), columns)), shape=(len(columns), count))

@@ -31,8 +31,14 @@ from warpshadow.device.parallel import Scratch, scratch_slot
 from warpshadow.maths.directions import BUNDLE, cell_radius
 from warpshadow.stages.convex.convex_blockers import ConvexBlockers, PlacedParts
 from warpshadow.stages.convex.joint_lanes import coverage_type, make_joint_functions, sums_type
-from warpshadow.stages.convex.part_bounds import PartInputs, make_bound_functions, task_type
-from warpshadow.stages.convex.silhouette import ADJOINT_LANES, EDGE_LANES, SUM_LANES, make_silhouette_functions
+from warpshadow.stages.convex.part_bounds import (
+    PartInputs,
+    make_bound_functions,
+    parts_scratch,
+    scratch_type,
+    task_type,
+)
+from warpshadow.stages.convex.silhouette import ADJOINT_LANES, make_silhouette_functions
 from warpshadow.stages.receivers.body_spans import Span, make_find_span, receiver_spans, span_values, value_of_span
 from warpshadow.stages.visibility.culling import make_cells
 from warpshadow.stages.visibility.directional import SOFTNESS
@@ -41,7 +47,7 @@ _PART_COST = 200.0  # mean time of a part of a receiver [ns]
 
 
 class _PartFunctions(NamedTuple):
-    """Kernel functions on the parts of a compound, which is a single piece if it has no hull."""
+    """Kernel functions on compounds: the pieces of a body with a hull are one; any other piece is one by itself."""
 
     prepare_block: wp.Function
     is_blocking: wp.Function
@@ -53,7 +59,7 @@ class _PartFunctions(NamedTuple):
 def _make_part_functions(lanes: int) -> _PartFunctions:
     """Make the kernel functions for a number of lanes."""
     Lane = lane_type(lanes)
-    PartsTask, Coverages, SumsOfBlockers = task_type(lanes), coverage_type(lanes), sums_type(lanes)
+    PartsTask, PartsScratch, Coverages = task_type(lanes), scratch_type(lanes), coverage_type(lanes)
     fn, silhouettes, joint = make_lane_functions(lanes), make_silhouette_functions(lanes), make_joint_functions(lanes)
     is_any_above, dot, scale, add, is_positive = fn.is_any_above, fn.dot, fn.scale, fn.add, fn.is_positive
     load, find_span = fn.load, make_find_span(lanes)
@@ -62,18 +68,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     no_blockers, with_blocker = joint.no_blockers, joint.with_blocker
 
     @wp.func
-    def prepare_block(
-        row: int,
-        worker: int,
-        inputs: PartInputs,
-        coverage: wp.array2d(dtype=Coverages),
-        is_hull: wp.array2d(dtype=Lane),
-        covered: wp.array2d(dtype=wp.int32),
-        sums: wp.array2d(dtype=SumsOfBlockers),
-        chord_sums: wp.array2d(dtype=Lane),
-        edges: wp.array2d(dtype=Lane),
-        numbers: wp.array3d(dtype=wp.int32),
-    ):
+    def prepare_block(row: int, worker: int, inputs: PartInputs, scratch: PartsScratch):
         """Load a block of receivers; nothing is covered yet."""
         block = find_span(inputs.spans, row)
         slot, instance = scratch_slot(worker, row), instance_in(block.batch, inputs.corners.shape[0])
@@ -87,17 +82,17 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         if inputs.horizon_normals:
             task.normals = load(inputs.horizon_normals[block.batch][block.first : block.end], block.number)
         task.lift = Lane(1.0) - is_positive(dot(task.normals, task.normals))
-        task.coverage = coverage[slot]
-        task.is_hull = is_hull[slot]
-        task.covered = covered[slot]
-        task.sums = sums[slot]
+        task.coverage = scratch.coverage[slot]
+        task.hull_weight = scratch.hull_weight[slot]
+        task.covered = scratch.covered[slot]
+        task.sums = scratch.sums[slot]
         task.silhouette.points = task.points
         task.silhouette.corners = inputs.corners[instance]
         task.silhouette.face_planes = inputs.face_planes[instance]
-        task.silhouette.facing = numbers[slot, 0]
-        task.silhouette.numbers = numbers[slot, 1]
-        task.silhouette.edges = edges[slot]
-        task.silhouette.sums = chord_sums[slot]
+        task.silhouette.facing = scratch.facing[slot]
+        task.silhouette.numbers = scratch.numbers[slot]
+        task.silhouette.edges = scratch.edges[slot]
+        task.silhouette.sums = scratch.chord_sums[slot]
         for q in range(task.coverage.shape[0]):
             task.coverage[q] = Coverages()
             task.sums[q] = no_blockers()
@@ -111,7 +106,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
 
     @wp.func
     def bound_by_hull(inputs: PartInputs, hull: int, task: PartsTask, covered_count: int):
-        """Where the hull of a compound covers less of a cell than its parts together, it is the hull that covers."""
+        """Replace the coverage by a compound's parts by that of its hull in cells of which the hull covers less."""
         bound = find_bound(inputs, hull, task)
         silhouette = task.silhouette
         count, is_solid = find_silhouette(inputs.parts, hull, silhouette)
@@ -123,23 +118,23 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
             by_parts = task.coverage[q]
             by_hull = find_coverage(inputs.parts, silhouette, direction, inputs.radius)
             is_reached = is_positive(find_reach(task, bound, direction))  # not where the receiver lies on the hull
-            is_hull = wp.cw_mul(is_reached, is_positive(by_parts.cell_share - by_hull.cell_share))
-            is_parts = Lane(1.0) - is_hull
-            task.is_hull[q] = is_hull
+            hull_weight = wp.cw_mul(is_reached, is_positive(by_parts.cell_share - by_hull.cell_share))
+            parts_weight = Lane(1.0) - hull_weight
+            task.hull_weight[q] = hull_weight
             task.coverage[q] = Coverages(
-                wp.cw_mul(is_parts, by_parts.cell_share) + wp.cw_mul(is_hull, by_hull.cell_share),
-                add(scale(is_parts, by_parts.moment), scale(is_hull, by_hull.moment)),
+                wp.cw_mul(parts_weight, by_parts.cell_share) + wp.cw_mul(hull_weight, by_hull.cell_share),
+                add(scale(parts_weight, by_parts.moment), scale(hull_weight, by_hull.moment)),
             )
 
     @wp.func
     def cover_by_compound(inputs: PartInputs, compound: int, task: PartsTask):
-        """Coverage by a compound of cells that no other covers wholly; returns how many it covers, and lists them."""
+        """Find the cells that a compound covers, and how; ``task.covered`` lists them. Return their number."""
         parts, cells, radius = inputs.parts, inputs.cells, inputs.radius
         first = parts.first_part[parts.first_piece[compound]]
         end = parts.first_part[parts.first_piece[compound + 1]]
         covered_count = int(0)
         silhouette = task.silhouette
-        max_sum = wp.where(parts.signs[end - 1] < 0.0, 1.0e30, 1.0)  # seams take off
+        max_sum = wp.where(parts.signs[end - 1] < 0.0, 1.0e30, 1.0)  # seams, subtracted later, bring a sum above 1 back
         for part in range(first, end):
             bound = find_bound(inputs, part, task)
             sign = parts.signs[part]
@@ -191,7 +186,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
 
 @functools.cache
 def _make_cover(lanes: int) -> wp.Kernel:
-    Lane, Coverages, SumsOfBlockers = lane_type(lanes), coverage_type(lanes), sums_type(lanes)
+    PartsScratch = scratch_type(lanes)
     fn, functions, joint = make_lane_functions(lanes), _make_part_functions(lanes), make_joint_functions(lanes)
     is_any_above, joint_coverage, store_columns = fn.is_any_above, joint.joint_coverage, joint.store_columns
     prepare_block, _, _, cover_by_all_compounds = functions
@@ -203,19 +198,13 @@ def _make_cover(lanes: int) -> wp.Kernel:
         # in
         inputs: PartInputs,
         # scratch
-        coverage: wp.array2d(dtype=Coverages),
-        is_hull: wp.array2d(dtype=Lane),
-        covered: wp.array2d(dtype=wp.int32),
-        sums: wp.array2d(dtype=SumsOfBlockers),
-        chord_sums: wp.array2d(dtype=Lane),
-        edges: wp.array2d(dtype=Lane),
-        numbers: wp.array3d(dtype=wp.int32),
+        scratch: PartsScratch,
         # out
         result: wp.array3d(dtype=wp.vec4),
     ):
         """A thread owns a block of receivers."""
         row = first_row + wp.tid()
-        task = prepare_block(row, worker, inputs, coverage, is_hull, covered, sums, chord_sums, edges, numbers)
+        task = prepare_block(row, worker, inputs, scratch)
         cover_by_all_compounds(inputs, task)
         for q in range(task.coverage.shape[0]):
             if is_any_above(task.sums[q].total, 0.0):
@@ -228,7 +217,7 @@ def _make_cover(lanes: int) -> wp.Kernel:
 
 @functools.cache
 def _make_cover_adjoint(lanes: int) -> wp.Kernel:
-    Lane, Vectors = lane_type(lanes), vectors_type(lanes)
+    Lane, Vectors, PartsScratch = lane_type(lanes), vectors_type(lanes), scratch_type(lanes)
     Coverages, SumsOfBlockers = coverage_type(lanes), sums_type(lanes)
     fn, functions, joint = make_lane_functions(lanes), _make_part_functions(lanes), make_joint_functions(lanes)
     is_any_above, is_positive, scale = fn.is_any_above, fn.is_positive, fn.scale
@@ -242,7 +231,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
 
     @wp.func(inline=True)
     def is_any(coverage: Coverages):
-        """Whether anything is not 0."""
+        """Whether any number of the coverage is not 0."""
         moment = coverage.moment
         highest = wp.max(wp.max(coverage.cell_share, moment.x), wp.max(moment.y, moment.z))
         lowest = wp.min(wp.min(coverage.cell_share, moment.x), wp.min(moment.y, moment.z))
@@ -256,13 +245,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
         inputs: PartInputs,
         adj_result: wp.array3d(dtype=wp.vec4),
         # scratch
-        coverage: wp.array2d(dtype=Coverages),
-        is_hull: wp.array2d(dtype=Lane),
-        covered: wp.array2d(dtype=wp.int32),
-        sums: wp.array2d(dtype=SumsOfBlockers),
-        chord_sums: wp.array2d(dtype=Lane),
-        edges: wp.array2d(dtype=Lane),
-        numbers: wp.array3d(dtype=wp.int32),
+        scratch: PartsScratch,
         adj_sums: wp.array2d(dtype=SumsOfBlockers),
         adj_edges: wp.array2d(dtype=Lane),
         # out
@@ -272,7 +255,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
     ):
         """A thread owns a block of receivers; cells that are covered wholly have no gradient."""
         row = first_row + wp.tid()
-        task = prepare_block(row, worker, inputs, coverage, is_hull, covered, sums, chord_sums, edges, numbers)
+        task = prepare_block(row, worker, inputs, scratch)
         task.silhouette.adj_edges = adj_edges[task.slot]
         parts, radius = inputs.parts, inputs.radius
         cover_by_all_compounds(inputs, task)
@@ -294,7 +277,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
                 q = task.covered[k]
                 adj = adj_sums[task.slot, q]
                 adj_coverage = blocker_adjoint(task.sums[q], adj, task.coverage[q])
-                # of equal ones, as the front and the back of a mug at its outline, the first is the largest
+                # one blocker has the gradient of max h: of equal ones, as both sides of a mug at its outline, the first
                 difference = task.sums[q].largest - task.coverage[q].cell_share
                 adj.largest = wp.cw_mul(adj.largest, is_positive(wp.max(difference, -difference)))
                 adj_sums[task.slot, q] = adj
@@ -320,12 +303,13 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
                                 silhouette.count = count
                                 silhouette.is_solid = is_solid
                                 is_found = True
-                                for i in range(ADJOINT_STRIDE * count):
+                                for i in range(ADJOINT_STRIDE * silhouette.count):
                                     silhouette.adj_edges[i] = Lane(0.0)
                             factor = parts.signs[part] * is_positive(reach)
                             if hull >= 0:
-                                by_hull = task.is_hull[q]
-                                factor = wp.cw_mul(factor, wp.where(number < end, Lane(1.0) - by_hull, by_hull))
+                                hull_weight = task.hull_weight[q]
+                                weight = wp.where(number < end, Lane(1.0) - hull_weight, hull_weight)
+                                factor = wp.cw_mul(factor, weight)
                             adj_cell = Coverages(
                                 wp.cw_mul(factor, task.coverage[q].cell_share), scale(factor, task.coverage[q].moment)
                             )
@@ -385,8 +369,7 @@ def part_coverage(
     inputs.skips = span_values(skips, points.device)
     inputs.on_surface = on_surface
     lanes = lane_count(points.device)
-    Lane, sums, edge_count = lane_type(lanes), sums_type(lanes), blockers.edge_count
-    by_cell = (len(directions),)
+    edge_count = blockers.edge_count
     cost = _PART_COST * lanes * placed_parts.bounds.shape[1]
     return launch_with_adjoint(
         _make_cover(lanes),
@@ -396,13 +379,11 @@ def part_coverage(
         result=empty((*points.shape, len(directions)), dtype=wp.vec4, device=points.device),
         variables=[points],
         shared=[placed_parts.corners],
-        scratch=[
-            *(Scratch(by_cell, dtype) for dtype in (coverage_type(lanes), Lane, wp.int32, sums)),
-            Scratch((SUM_LANES,), Lane),
-            Scratch((EDGE_LANES * edge_count,), Lane),
-            Scratch((2, edge_count), wp.int32),
+        scratch=[parts_scratch(lanes, len(directions), edge_count)],
+        adj_scratch=[
+            Scratch((len(directions),), sums_type(lanes)),
+            Scratch((ADJOINT_LANES * edge_count,), lane_type(lanes)),
         ],
-        adj_scratch=[Scratch(by_cell, sums), Scratch((ADJOINT_LANES * edge_count,), Lane)],
         cost=cost,
         adj_cost=3 * cost,
     )

@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from warpshadow.device.lanes import lane_type, make_lane_functions, vectors_type
+from warpshadow.device.parallel import ScratchStruct
 from warpshadow.stages.convex.convex_blockers import UNSEEN, ConvexArrays
 from warpshadow.stages.convex.joint_lanes import coverage_type, sums_type
-from warpshadow.stages.convex.silhouette import silhouette_type
+from warpshadow.stages.convex.silhouette import EDGE_LANES, SUM_LANES, silhouette_type
 from warpshadow.stages.receivers.body_spans import ReceiverBlock, ReceiverSpans, SpanValues
 from warpshadow.stages.visibility.culling import DirectionCells
 
@@ -40,6 +41,33 @@ class PartInputs:
 
 
 @functools.cache
+def scratch_type(lanes: int) -> Any:
+    """Struct of scratch memory, a row for each block of receivers: as in the fields of the same names of its task."""
+    Lane, Coverages, SumsOfBlockers = lane_type(lanes), coverage_type(lanes), sums_type(lanes)
+
+    @wp.struct
+    class PartsScratch:
+        coverage: wp.array2d(dtype=Coverages)
+        hull_weight: wp.array2d(dtype=Lane)
+        covered: wp.array2d(dtype=wp.int32)
+        sums: wp.array2d(dtype=SumsOfBlockers)
+        facing: wp.array2d(dtype=wp.int32)
+        numbers: wp.array2d(dtype=wp.int32)
+        edges: wp.array2d(dtype=Lane)
+        chord_sums: wp.array2d(dtype=Lane)
+
+    return PartsScratch
+
+
+def parts_scratch(lanes: int, cell_count: int, edge_count: int) -> ScratchStruct:
+    """Scratch memory for cells, and for parts of up to so many edges."""
+    shapes = dict.fromkeys(("coverage", "hull_weight", "covered", "sums"), (cell_count,))
+    shapes |= {"facing": (edge_count,), "numbers": (edge_count,)}
+    shapes |= {"edges": (EDGE_LANES * edge_count,), "chord_sums": (SUM_LANES,)}
+    return ScratchStruct(scratch_type(lanes), shapes)
+
+
+@functools.cache
 def task_type(lanes: int) -> Any:
     """Struct of a block of receivers, and memory for its cells."""
     Lane, Vectors, Silhouette = lane_type(lanes), vectors_type(lanes), silhouette_type(lanes)
@@ -56,7 +84,7 @@ def task_type(lanes: int) -> Any:
         normals: Vectors
         lift: Lane  # 1 where there is no horizon, else 0
         coverage: wp.array(dtype=Coverages)  # [direction] by a compound, 0 between compounds
-        is_hull: wp.array(dtype=Lane)  # [direction] 1 where its hull covers, else 0; not set without one
+        hull_weight: wp.array(dtype=Lane)  # [direction] 1 where its hull covers, else 0; not set without one
         covered: wp.array(dtype=wp.int32)  # numbers of the cells in which that is not 0
         sums: wp.array(dtype=SumsOfBlockers)  # [direction] over compounds
         silhouette: Silhouette

@@ -289,7 +289,7 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
 
     @wp.func
     def find_silhouette(parts: ConvexArrays, part: int, silhouette: Silhouette):
-        """Store a part's silhouette; returns how many edges it has, and where it is solid: see the struct."""
+        """Store a part's silhouette; return its ``count`` and ``is_solid``: the struct would take 47 registers more."""
         first_face = parts.first_face[part]
         face_count = parts.first_face[part + 1] - first_face
         outside = int(0)

@@ -37,7 +37,7 @@ wp.set_module_options({"max_unroll": 1})
 
 @wp.func
 def _gap_to_edge(edge: wp.vec4, u: float, v: float):
-    """The way from the nearest point of an edge to a point."""
+    """Vector from the nearest point of an edge to a point."""
     x = edge[2] - edge[0]
     y = edge[3] - edge[1]
     position = wp.clamp(((u - edge[0]) * x + (v - edge[1]) * y) / wp.max(x * x + y * y, 1.0e-30), 0.0, 1.0)
@@ -80,7 +80,7 @@ def _blocked_share(
     beam: wp.vec3,
     area: wp.vec3,
 ):
-    """The share a, given the plane's frame, the lamp's side of it, x, y − x and the area vector A of the sample."""
+    """Blocked share a of a beam by a plane: its frame, the lamp's side of it, x, y − x, the sample's area vector A."""
     normal = wp.normalize(wp.cross(axis_u, axis_v))
     scale = wp.length(axis_u)
     distance = wp.length(beam)

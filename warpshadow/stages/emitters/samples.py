@@ -208,7 +208,7 @@ class SamplePieces(NamedTuple):
 
     @classmethod
     def of_emitters(cls, weights: Sequence[SampleWeights], corners: SparseMatrix) -> SamplePieces:
-        """Of the samples of some emitters, given the weights of all vertices in the corners of their pieces."""
+        """Make the pieces of some emitters' samples, given the weights of all vertices in the pieces' corners."""
         device = corners.rows.row_starts.device
         first = np.cumsum([0, *itertools.chain.from_iterable(np.diff(item.first_pieces) for item in weights)])
         constants = zip(*((item.elongations, item.softness) for item in weights), strict=True)

@@ -30,13 +30,13 @@ wp.set_module_options({"max_unroll": 1})
 
 @wp.func
 def log_transmittance(blocked_share: float):
-    """Logarithm of the light that a blocker of a share leaves, of a beam."""
+    """Logarithm of a beam's transmittance past a blocker of a share."""
     return wp.log(wp.max(1.0 - blocked_share, MIN_TRANSMITTANCE))
 
 
 @wp.func
 def _blocked_share(offset: wp.vec3, beam: wp.vec3, disc_radius: float, radius: float):
-    """The share a, given c − x, y − x, R and r."""
+    """Blocked share a of a beam by a sphere, given c − x, y − x, R and r."""
     distance = wp.length(beam)
     direction = beam / distance
     depth = wp.dot(offset, direction)

@@ -109,7 +109,7 @@ def emitting_faces(
 
 
 def _mean_radiance(textures: EmissionTextures) -> np.ndarray:
-    """About the mean radiance of textured faces, never 0 where a texture is not: it says how often a face is drawn."""
+    """Estimate the mean radiance of textured faces, by which faces are drawn: above 0 where the texture is."""
     texture_of_face, uvs, uv_faces = (item.numpy() for item in textures[1:])
     texels, levels = textures.textures.texels.numpy()[0].mean(axis=1), textures.textures.levels.numpy()
     radiance = np.zeros(len(texture_of_face))
@@ -193,7 +193,7 @@ def _beam_to_point(
 def _beam_to_facing_point(
     surface: EmitterSurface, sample: int, start: int, point: wp.vec3, normal: wp.vec3, is_two_sided: int
 ):
-    """The way to the first point, from a start on, that faces the receiver above its horizon, and how much."""
+    """Beam and facing of the first point, from ``start`` on, that faces the receiver above its horizon."""
     point_count = surface.point_faces.shape[1]
     beam = wp.vec3()
     facing = float(0.0)

@@ -23,7 +23,7 @@ def _edge_light(a: wp.vec3, b: wp.vec3, normal: wp.vec3):
 
 @wp.func
 def _cut(a: wp.vec3, b: wp.vec3, normal: wp.vec3):
-    """The start of the part of an edge from a to b above the horizon, where the edge has one."""
+    """Start of the part above the horizon of an edge from a to b that has such a part."""
     height = wp.dot(a, normal)
     other = wp.dot(b, normal)
     rises = height < 0.0 and other > 0.0
@@ -42,7 +42,7 @@ def _cut_edge_light(a: wp.vec3, b: wp.vec3, normal: wp.vec3):
 
 @wp.func
 def _crossing(a: wp.vec3, b: wp.vec3, normal: wp.vec3):
-    """Where an edge from a to b sinks below the horizon; 0 where it does not."""
+    """Point at which an edge from a to b sinks below the horizon; 0 for one that does not."""
     sinks = wp.dot(a, normal) > 0.0 and wp.dot(b, normal) <= 0.0
     return wp.where(sinks, _cut(b, a, normal), wp.vec3())
 

@@ -25,7 +25,7 @@ class OneRings:
 
     @staticmethod
     def of_faces(faces: np.ndarray, vertex_count: int, *, device: wp.DeviceLike) -> "OneRings":
-        """Find them for faces [face, 3] of a number of vertices."""
+        """Find the rings of ``vertex_count`` vertices from faces [face, 3]."""
         corners = faces.ravel()
         starts = np.cumsum([0, *np.bincount(corners, minlength=vertex_count)])
         faces = faces[np.argsort(corners, kind="stable") // 3]

@@ -15,7 +15,7 @@ from warpshadow.stages.geometry.rotations import check_orthonormal
 
 @wp.func
 def _posed(rotation: wp.mat33, translation: wp.vec3, scale: float, rest: wp.vec3):
-    """S R x + t."""
+    """The point S R x + t."""
     return scale * (rotation * rest) + translation
 
 
@@ -115,7 +115,7 @@ class Poses:
         look_at_values(self.rotations, lambda values: check_orthonormal(values.astype(np.float64)))
 
     def about(self, pivots: wp.array) -> "Poses":
-        """The poses x → s R (x − pivot) + t, if these have t: it is where the pivot goes.
+        """Poses x → s R (x − pivot) + t: translations t are where pivots go.
 
         Args:
             pivots: A point of each body in its own space, vec3 of shape [batch, body]; either batch may be 1.

@@ -34,14 +34,13 @@ def _weigh_by_faces(
     positions: wp.array2d(dtype=wp.vec3),
     normals: wp.array2d(dtype=wp.vec3),
     directions: wp.array3d(dtype=wp.vec3),
-    filters: wp.array3d(dtype=wp.vec3),
+    weights: wp.array3d(dtype=wp.vec2),
     # out
-    weighed: wp.array3d(dtype=wp.vec3),
+    weighed: wp.array3d(dtype=wp.vec2),
 ):
     """A thread owns a sample."""
     row, sample = wp.tid()
     batch, receiver = split_row(first_row + row, weighed.shape[1])
-    weights = filters[batch, receiver, sample]
     above_face = float(1.0)
     face = face_ids[instance_in(batch, face_ids.shape[0]), receiver]
     if face >= 0:
@@ -55,7 +54,7 @@ def _weigh_by_faces(
         side = wp.dot(face_normal, normals[instance_in(batch, normals.shape[0]), receiver])
         height = wp.dot(face_normal, directions[batch, receiver, sample]) * wp.where(side < 0.0, -1.0, 1.0)
         above_face = wp.smoothstep(-_DEPTH, 0.0, height)
-    weighed[batch, receiver, sample] = wp.vec3(above_face * weights[0], above_face * weights[1], weights[2])
+    weighed[batch, receiver, sample] = above_face * weights[batch, receiver, sample]
 
 
 def weigh_by_faces(
@@ -64,7 +63,7 @@ def weigh_by_faces(
     positions: wp.array,
     normals: wp.array,
     directions: wp.array,
-    filters: wp.array,
+    weights: wp.array,
 ) -> wp.array:
     """Weigh samples of lobes by where they are above the faces of their receivers.
 
@@ -74,23 +73,23 @@ def weigh_by_faces(
         positions: Of vertices [scene units], vec3 of shape [batch, vertex].
         normals: Of receivers, whose side counts, vec3 of shape [batch, receiver].
             Any of these batches may be 1 and then serves every instance.
-        directions, filters: Of :func:`.lobes.sample_lobes`, vec3 of shape [batch, receiver, sample].
+        directions, weights: Of :func:`.lobes.sample_lobes`, vec3 and vec2 of shape [batch, receiver, sample].
 
     Returns:
-        Filters, vec3 of shape [batch, receiver, sample].
+        Weights, vec2 of shape [batch, receiver, sample].
 
-    Differentiable: positions, directions, filters.
+    Differentiable: positions, directions, weights.
     """
-    check.shape("filters", filters.shape, directions.shape)
-    arrays = {"fragments": fragments.face_ids, "positions": positions, "normals": normals, "filters": filters}
-    assert common_batch(arrays) == len(filters)
-    weighed = wp.empty(filters.shape, dtype=wp.vec3, device=filters.device)
+    check.shape("weights", weights.shape, directions.shape)
+    arrays = {"fragments": fragments.face_ids, "positions": positions, "normals": normals, "weights": weights}
+    assert common_batch(arrays) == len(weights)
+    weighed = wp.empty(weights.shape, dtype=wp.vec2, device=weights.device)
     launch(
         _weigh_by_faces,
-        (len(filters) * filters.shape[1], filters.shape[2]),
-        inputs=[fragments.face_ids, faces, positions, normals, directions, filters],
+        (len(weights) * weights.shape[1], weights.shape[2]),
+        inputs=[fragments.face_ids, faces, positions, normals, directions, weights],
         outputs=[weighed],
         shared=[positions],
-        cost=_COST * filters.shape[2],
+        cost=_COST * weights.shape[2],
     )
     return weighed

@@ -157,7 +157,7 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
 
     @wp.func
     def load_or_zero(vectors: wp.array(dtype=wp.vec3), first: int):
-        """A block of vectors; zeros past the last, which sums over lanes count in."""
+        """Load a block of vectors, zeros past the last, since sums over lanes include those."""
         x = Lane()
         y = Lane()
         z = Lane()
@@ -202,7 +202,8 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         sample_points: wp.array3d(dtype=Lane),
         # out
         directions: wp.array3d(dtype=wp.vec3),
-        filters: wp.array3d(dtype=wp.vec3),
+        weights: wp.array3d(dtype=wp.vec2),
+        blurs: wp.array3d(dtype=wp.float32),
     ):
         """A thread owns a receiver."""
         batch, receiver = split_row(first_row + wp.tid(), directions.shape[1])
@@ -249,7 +250,8 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
                 directions[batch, receiver, first + lane] = wp.vec3(
                     direction_x[lane], direction_y[lane], direction_z[lane]
                 )
-                filters[batch, receiver, first + lane] = wp.vec3(weight[lane], weight_f90[lane], blur[lane])
+                weights[batch, receiver, first + lane] = wp.vec2(weight[lane], weight_f90[lane])
+                blurs[batch, receiver, first + lane] = blur[lane]
 
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def sample_lobes_adjoint(
@@ -265,7 +267,8 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         places: wp.array2d(dtype=wp.int32),
         sample_points: wp.array3d(dtype=Lane),
         adj_directions: wp.array3d(dtype=wp.vec3),
-        adj_filters: wp.array3d(dtype=wp.vec3),
+        adj_weights: wp.array3d(dtype=wp.vec2),
+        adj_blurs: wp.array3d(dtype=wp.float32),
         # out
         adj_normals: wp.array2d(dtype=wp.vec3),
         adj_tangents: wp.array2d(dtype=wp.vec3),
@@ -326,9 +329,17 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             fresnel_fourth = wp.cw_mul(fresnel_square, fresnel_square)
 
             adj_direction = load_or_zero(adj_directions[batch, receiver], block * lanes)
-            adj_filter = load_or_zero(adj_filters[batch, receiver], block * lanes)
-            adj_weight = adj_filter.x + wp.cw_mul(adj_filter.y, wp.cw_mul(fresnel_fourth, fresnel_base))
-            adj_view_cosine = -5.0 * wp.cw_mul(wp.cw_mul(adj_filter.y, weight), fresnel_fourth)
+            adj_weight = Lane()
+            adj_weight_f90 = Lane()
+            adj_blur = Lane()
+            first = block * lanes
+            for lane in range(wp.min(lanes, adj_directions.shape[2] - first)):
+                adj_pair = adj_weights[batch, receiver, first + lane]
+                adj_weight[lane] = adj_pair[0]
+                adj_weight_f90[lane] = adj_pair[1]
+                adj_blur[lane] = adj_blurs[batch, receiver, first + lane]
+            adj_weight += wp.cw_mul(adj_weight_f90, wp.cw_mul(fresnel_fourth, fresnel_base))
+            adj_view_cosine = -5.0 * wp.cw_mul(wp.cw_mul(adj_weight_f90, weight), fresnel_fourth)
             adj_ratio = wp.cw_div(adj_weight, denominator)
             adj_weight_scale += wp.cw_mul(adj_ratio, up)
             adj_denominator = -1.0 * wp.cw_mul(adj_ratio, weight)
@@ -355,7 +366,7 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             )
             # of the unit vector, and of the blur, which is |cap|² / |mirror|²
             radial = dot(mirror, adj_mirror)
-            blur_ratio = wp.cw_div(adj_filter.z, square)
+            blur_ratio = wp.cw_div(adj_blur, square)
             adj_blur_scale += wp.cw_mul(blur_ratio, cap_square)
             adj_cap_square = 2.0 * blur_scale * blur_ratio
             radial += wp.cw_mul(adj_cap_square, cap_square)
@@ -399,7 +410,8 @@ class LobeSamples(NamedTuple):
     """Samples of the lobes of receivers, and the receivers' cosines."""
 
     directions: wp.array  # unit vectors, vec3 of shape [batch, receiver, sample]
-    filters: wp.array  # w, w' and the blur σ [radians], vec3 of the same shape
+    weights: wp.array  # w and w', vec2 of the same shape
+    blurs: wp.array  # σ [radians], float32 of the same shape
     cosines: wp.array  # μ between normals and viewers, float32 of shape [batch, receiver]
     lobes: Lobes
 
@@ -450,7 +462,8 @@ def sample_lobes(
     sample_points = np.swapaxes(sample_points, 1, 2).reshape(place_count, 3, -1, lanes)
     sampled = [*lobes, place_count**-_BLUR_POWER, places, constant(sample_points, lane_type(lanes), device)]
     sample, sample_adjoint = _make_sample_lobes(lanes)
-    results = [wp.empty((*shape, sample_count), dtype=wp.vec3, device=device) for _ in range(2)]
+    dtypes = wp.vec3, wp.vec2, wp.float32
+    results = [wp.empty((*shape, sample_count), dtype=dtype, device=device) for dtype in dtypes]
     if varies(lobes):
         for result in results:
             require_gradient(result)
@@ -462,4 +475,4 @@ def sample_lobes(
         launch(sample_adjoint, rows, inputs=[*sampled, *gradients], outputs=outputs, cost=2 * cost)
 
     record_adjoint(adjoint, [*lobes, *results])
-    return LobeSamples(results[0], results[1], cosines, lobes)
+    return LobeSamples(results[0], results[1], results[2], cosines, lobes)

@@ -7,7 +7,8 @@ the mean radiance R̄ of the receiver's blockers the point adds
 
 m how metallic it is, a its albedo, B the radiosity of its side of the face, and L' the radiance from l': R̄ where that
 ray meets a body, 0 where it leaves below the face that it starts on (:mod:`.lobe_hits`), else L, light without shadows,
-blurred by σ'² = σ² + 2 α²: σ is the blur of the sample (:mod:`.lobes`), √2 α that of a whole lobe, seen from above.
+blurred by σ'² = σ² + 2 α², since variances of Gaussians add: σ is the blur of the sample (:mod:`.lobes`), and √2 α the
+σ of a lobe's only sample, N = K = 1, seen from above, v = h = n, where |W| = α² and μ = Λ = 1.
 Where l itself leaves below the receiver's face, M = −(1 − T) R̄. Where light bounces along paths, B is R̄.
 """
 
@@ -38,16 +39,17 @@ def _mirror(
     faces: wp.array(dtype=wp.vec3i),
     roughness: wp.array2d(dtype=wp.float32),
     directions: wp.array3d(dtype=wp.vec3),
-    filters: wp.array3d(dtype=wp.vec3),
+    blurs: wp.array3d(dtype=wp.float32),
     # out
     mirrored: wp.array3d(dtype=wp.vec3),
-    mirrored_filters: wp.array3d(dtype=wp.vec3),
+    fresnel_weights: wp.array3d(dtype=wp.float32),
+    mirrored_blurs: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a sample."""
     row, sample = wp.tid()
     batch, receiver = split_row(first_row + row, mirrored.shape[1])
     direction = directions[instance_in(batch, directions.shape[0]), receiver, sample]
-    blur = filters[instance_in(batch, filters.shape[0]), receiver, sample][2]
+    blur = blurs[instance_in(batch, blurs.shape[0]), receiver, sample]
     fresnel_weight = float(0.0)
     hit_batch = instance_in(batch, face_ids.shape[0])
     face = face_ids[hit_batch, receiver, sample]
@@ -63,18 +65,20 @@ def _mirror(
         fresnel_weight = fresnel_base * fresnel_base * fresnel_base * fresnel_base * fresnel_base
         direction = direction - 2.0 * cosine * normal
     mirrored[batch, receiver, sample] = direction
-    mirrored_filters[batch, receiver, sample] = wp.vec3(fresnel_weight, 0.0, blur)
+    fresnel_weights[batch, receiver, sample] = fresnel_weight
+    mirrored_blurs[batch, receiver, sample] = blur
 
 
 class MirroredDirections(NamedTuple):
-    """Where bodies that lobes meet mirror light from; that of other samples is the sample itself."""
+    """Directions from which the bodies that lobes meet mirror light; samples that meet none keep their own."""
 
     directions: wp.array  # l', vec3 of shape [batch, receiver, sample]
-    filters: wp.array  # (1 − |n·l|)⁵, 0 and σ' [radians], vec3 of the same shape
+    fresnel_weights: wp.array  # (1 − |n·l|)⁵, float32 of the same shape
+    blurs: wp.array  # σ' [radians], float32 of the same shape
 
 
 def mirror(
-    hits: LobeHits, faces: wp.array, roughness: wp.array, directions: wp.array, filters: wp.array
+    hits: LobeHits, faces: wp.array, roughness: wp.array, directions: wp.array, blurs: wp.array
 ) -> MirroredDirections:
     """Find the directions that the points mirror.
 
@@ -82,20 +86,21 @@ def mirror(
         hits: Of :func:`.lobe_hits.trace_hits`, of all instances, [batch, receiver, sample].
         faces: Vertices of the sides of its faces, vec3i of shape [2 · face].
         roughness: Of the vertices, float32 of shape [batch, vertex].
-        directions, filters: Of :func:`.lobes.sample_lobes`. Any batch may be 1 and then serves every instance.
+        directions, blurs: Of :func:`.lobes.sample_lobes`. Any batch may be 1 and then serves every instance.
 
-    Differentiable: roughness, directions, filters. Not: hits, which stay where they are on their faces.
+    Differentiable: roughness, directions, blurs. Not: hits, which stay where they are on their faces.
     """
-    arrays = {"directions": directions, "filters": filters, "roughness": roughness, "hits": hits.face_ids}
+    arrays = {"directions": directions, "blurs": blurs, "roughness": roughness, "hits": hits.face_ids}
     shape = common_batch(arrays), *directions.shape[1:]
-    result = MirroredDirections(*(wp.empty(shape, dtype=wp.vec3, device=directions.device) for _ in range(2)))
+    dtypes = wp.vec3, wp.float32, wp.float32
+    result = MirroredDirections(*(wp.empty(shape, dtype=dtype, device=directions.device) for dtype in dtypes))
     of_hits = [hits.face_ids, hits.barycentrics, hits.normals]
     launch(
         _mirror,
         (shape[0] * shape[1], shape[2]),
-        inputs=[*of_hits, faces, roughness, directions, filters],
+        inputs=[*of_hits, faces, roughness, directions, blurs],
         outputs=[*result],
-        shared=[roughness, *(array for array in (directions, filters) if len(array) < shape[0])],
+        shared=[roughness, *(array for array in (directions, blurs) if len(array) < shape[0])],
         cost=_COST * shape[2],
     )
     return result
@@ -112,7 +117,7 @@ def _mix_mirrored(
     faces: wp.array(dtype=wp.vec3i),
     albedo: wp.array2d(dtype=wp.vec3),
     metallic: wp.array2d(dtype=wp.float32),
-    filters: wp.array3d(dtype=wp.vec3),
+    fresnel_weights: wp.array3d(dtype=wp.float32),
     light: wp.array3d(dtype=wp.vec3),
     mean_radiance: wp.array2d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
@@ -135,7 +140,7 @@ def _mix_mirrored(
         weights = barycentrics[hit_batch, receiver, sample]
         color = interpolate_at(albedo[instance_in(batch, albedo.shape[0])], faces[face], weights)
         metal_share = interpolate_at(metallic[instance_in(batch, metallic.shape[0])], faces[face], weights)
-        fresnel_weight = filters[instance_in(batch, filters.shape[0]), receiver, sample][0]
+        fresnel_weight = fresnel_weights[instance_in(batch, fresnel_weights.shape[0]), receiver, sample]
         seen = mean
         if last_ray == MEETS_SKY:
             seen = light[instance_in(batch, light.shape[0]), receiver, sample]
@@ -154,7 +159,7 @@ def mix_mirrored(
     faces: wp.array,
     albedo: wp.array,
     metallic: wp.array,
-    filters: wp.array,
+    fresnel_weights: wp.array,
     light: wp.array,
     mean_radiance: wp.array,
     transmittance: wp.array,
@@ -165,7 +170,7 @@ def mix_mirrored(
     Args:
         hits, faces: As of :func:`mirror`.
         albedo, metallic: Of the vertices, vec3 and float32 of shape [batch, vertex].
-        filters: Of :func:`mirror`.
+        fresnel_weights: Of :func:`mirror`.
         light: L, vec3 of shape [batch, receiver, sample].
         mean_radiance: R̄, of :func:`.reflection.find_blocked_radiance`, vec3 of shape [batch, receiver].
         transmittance: T, float32 of shape [batch, receiver, sample].
@@ -177,8 +182,8 @@ def mix_mirrored(
 
     Differentiable: all but hits.
     """
-    values = {"albedo": albedo, "metallic": metallic, "filters": filters, "light": light, "blocked": mean_radiance}
-    values |= {"transmittance": transmittance, "radiosity": radiosity}
+    values = {"albedo": albedo, "metallic": metallic, "fresnel_weights": fresnel_weights, "light": light}
+    values |= {"mean_radiance": mean_radiance, "transmittance": transmittance, "radiosity": radiosity}
     shape = common_batch({"hits": hits.face_ids, **values}), *light.shape[1:]
     radiance = wp.empty(shape, dtype=wp.vec3, device=light.device)
     launch(
@@ -189,7 +194,7 @@ def mix_mirrored(
         shared=[
             albedo,
             metallic,
-            *(array for array in (filters, light, mean_radiance, transmittance) if len(array) < shape[0]),
+            *(array for array in (fresnel_weights, light, mean_radiance, transmittance) if len(array) < shape[0]),
             *(array for array in (radiosity,) if array is not None),
         ],
         cost=_COST * shape[2],

@@ -103,7 +103,7 @@ def _level_offsets(texel_count: int) -> np.ndarray:
 
 @wp.struct
 class TexelPlace:
-    """Four texels of a level around a direction, and where it is between them."""
+    """The four texels of a level around a direction, and its position between them."""
 
     upper_left: int
     upper_right: int
@@ -147,7 +147,7 @@ def _interpolate_texels(texels: wp.array(dtype=wp.vec3), place: TexelPlace):
 
 @wp.func
 def _slopes(texels: wp.array(dtype=wp.vec3), place: TexelPlace, adj: wp.vec3):
-    """The gradient's product with the light of a level, and with its slopes along rows and columns."""
+    """Products of the gradient with the light of a level, and with its slopes along rows and columns."""
     upper_left = wp.dot(adj, texels[place.upper_left])
     upper_right = wp.dot(adj, texels[place.upper_right])
     lower_left = wp.dot(adj, texels[place.lower_left])
@@ -171,7 +171,7 @@ def _add_to_texels(adj: wp.vec3, place: TexelPlace, adj_texels: wp.array(dtype=w
 
 @wp.func
 def _find_height(blur: float, texels_per_radian: float):
-    """Height of a blur [radians] over level 0, in levels."""
+    """Level, from 0 on and fractional, whose blur is the given one [radians]."""
     # half a texel of the map itself is between levels 0 and 1
     return wp.clamp(wp.log2(wp.max(blur * texels_per_radian, 0.5)) + 1.0, 0.0, float(_LEVELS) - 1.001)
 
@@ -210,7 +210,7 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         texels: wp.array2d(dtype=wp.vec3),
         levels: wp.array(dtype=wp.vec2i),
         directions: wp.array3d(dtype=wp.vec3),
-        filters: wp.array3d(dtype=wp.vec3),
+        blurs: wp.array3d(dtype=wp.float32),
         # out
         light: wp.array3d(dtype=wp.vec3),
     ):
@@ -223,7 +223,7 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             sample_directions = load(directions[batch, receiver], block)
             half_turns, turns, _sine = find_place_angles(sample_directions.x, sample_directions.y, sample_directions.z)
             for lane in range(wp.min(lanes, light.shape[2] - first)):
-                height = _find_height(filters[batch, receiver, first + lane][2], texels_per_radian)
+                height = _find_height(blurs[batch, receiver, first + lane], texels_per_radian)
                 level = int(height)
                 lower = _find_place(levels[level][0], levels[level][1], half_turns[lane], turns[lane])
                 upper = _find_place(levels[level + 1][0], levels[level + 1][1], half_turns[lane], turns[lane])
@@ -239,11 +239,11 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         texels: wp.array2d(dtype=wp.vec3),
         levels: wp.array(dtype=wp.vec2i),
         directions: wp.array3d(dtype=wp.vec3),
-        filters: wp.array3d(dtype=wp.vec3),
+        blurs: wp.array3d(dtype=wp.float32),
         adj_light: wp.array3d(dtype=wp.vec3),
         # out
         adj_directions: wp.array3d(dtype=wp.vec3),
-        adj_filters: wp.array3d(dtype=wp.vec3),
+        adj_blurs: wp.array3d(dtype=wp.float32),
         adj_texels: wp.array2d(dtype=wp.vec3),
     ):
         """A thread owns a receiver."""
@@ -259,7 +259,7 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             adj_azimuth = Lane()
             for lane in range(wp.min(lanes, adj_light.shape[2] - first)):
                 adj = adj_light[batch, receiver, first + lane]
-                blur = filters[batch, receiver, first + lane][2]
+                blur = blurs[batch, receiver, first + lane]
                 height = _find_height(blur, texels_per_radian)
                 level = int(height)
                 upper_share = height - float(level)
@@ -274,11 +274,9 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
                 blurred_rows = float(levels[level + 1][1]) / wp.pi
                 adj_polar[lane] = (1.0 - upper_share) * rows * sharp[1] + upper_share * blurred_rows * soft[1]
                 adj_azimuth[lane] = (1.0 - upper_share) * rows * sharp[2] + upper_share * blurred_rows * soft[2]
-                if adj_filters and height > 0.0 and height < float(_LEVELS) - 1.001:
+                if adj_blurs and height > 0.0 and height < float(_LEVELS) - 1.001:
                     adj_blur = (soft[0] - sharp[0]) / (blur * wp.log(2.0))
-                    adj_filters[batch, receiver, first + lane] = adj_filters[batch, receiver, first + lane] + wp.vec3(
-                        0.0, 0.0, adj_blur
-                    )
+                    adj_blurs[batch, receiver, first + lane] = adj_blurs[batch, receiver, first + lane] + adj_blur
             if adj_directions:
                 # of the angle of y + i sine, and of that of -z + i x
                 square = wp.max(wp.cw_mul(sine, sine), Lane(1.0e-12))
@@ -297,23 +295,23 @@ def _make_look_up(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
     return look_up, look_up_adjoint
 
 
-def look_up_light(texels: wp.array, directions: wp.array, filters: wp.array) -> wp.array:
+def look_up_light(texels: wp.array, directions: wp.array, blurs: wp.array) -> wp.array:
     """Look up light from the directions of lobes.
 
     Args:
         texels: Of :func:`prefilter`, linear RGB, vec3 of shape [batch, texel].
-        directions, filters: Of :func:`.lobes.sample_lobes`, [batch, receiver, sample]. Either batch may be 1.
+        directions, blurs: Of :func:`.lobes.sample_lobes`, [batch, receiver, sample]. Either batch may be 1.
 
     Returns:
         Radiance, vec3 of shape [batch, receiver, sample].
 
-    Differentiable: texels, directions, filters.
+    Differentiable: texels, directions, blurs.
     """
-    check.shape("filters", filters.shape, ("batch", *directions.shape[1:]))
-    count = common_batch({"texels": texels, "directions": directions, "filters": filters})
+    check.shape("blurs", blurs.shape, ("batch", *directions.shape[1:]))
+    count = common_batch({"texels": texels, "directions": directions, "blurs": blurs})
     device = directions.device
-    directions, filters = expand_rows(directions, count), expand_rows(filters, count)
-    inputs = [texels, constant(_level_offsets(texels.shape[1]), wp.vec2i, device), directions, filters]
+    directions, blurs = expand_rows(directions, count), expand_rows(blurs, count)
+    inputs = [texels, constant(_level_offsets(texels.shape[1]), wp.vec2i, device), directions, blurs]
     look_up, look_up_adjoint = _make_look_up(lane_count(device))
     row_count, cost = count * directions.shape[1], _COST * directions.shape[2]
     return differentiable(
@@ -322,10 +320,10 @@ def look_up_light(texels: wp.array, directions: wp.array, filters: wp.array) -> 
             look_up_adjoint,
             row_count,
             inputs=[*inputs, adj_light],
-            outputs=[directions.grad, filters.grad],
+            outputs=[directions.grad, blurs.grad],
             sums=[texels.grad],
             cost=2 * cost,
         ),
         result=empty(directions.shape, dtype=wp.vec3, device=device),
-        variables=[texels, directions, filters],
+        variables=[texels, directions, blurs],
     )

@@ -40,7 +40,7 @@ def _sum_lobes(
     first_row: int,
     worker: int,
     # in
-    filters: wp.array3d(dtype=wp.vec3),
+    weights: wp.array3d(dtype=wp.vec2),
     light: wp.array3d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
     blocked_light: wp.array2d(dtype=wp.vec3),
@@ -51,15 +51,15 @@ def _sum_lobes(
 ):
     """A thread owns a receiver: G and G'."""
     batch, receiver = split_row(first_row + wp.tid(), light_f0.shape[1])
-    filter_batch = instance_in(batch, filters.shape[0])
+    weight_batch = instance_in(batch, weights.shape[0])
     light_batch = instance_in(batch, light.shape[0])
     transmittance_batch = instance_in(batch, transmittance.shape[0])
     blocked_batch = instance_in(batch, blocked_light.shape[0])
     mirrored_batch = instance_in(batch, mirrored_light.shape[0])
     sum_f0 = wp.vec3()
     sum_f90 = wp.vec3()
-    for i in range(filters.shape[2]):
-        weight = filters[filter_batch, receiver, i]
+    for i in range(weights.shape[2]):
+        weight = weights[weight_batch, receiver, i]
         open_share = transmittance[transmittance_batch, receiver, i]
         radiance = open_share * light[light_batch, receiver, i]
         if blocked_light:
@@ -80,7 +80,7 @@ class LobeLight(NamedTuple):
 
 
 def sum_lobes(
-    filters: wp.array,
+    weights: wp.array,
     light: wp.array,
     transmittance: wp.array,
     blocked_light: wp.array | None = None,
@@ -89,7 +89,7 @@ def sum_lobes(
     """Sum the light of lobes.
 
     Args:
-        filters: Of :func:`.lobes.sample_lobes`, vec3 of shape [batch, receiver, sample].
+        weights: Of :func:`.lobes.sample_lobes`, vec2 of shape [batch, receiver, sample].
         light: Radiance from the samples, vec3 of shape [batch, receiver, sample].
         transmittance: Float32 of shape [batch, receiver, sample].
         blocked_light: R, of :func:`find_blocked_radiance`, vec3 of shape [batch, receiver]; None where light does not
@@ -98,17 +98,17 @@ def sum_lobes(
 
     Differentiable: all.
     """
-    arrays = {"filters": filters, "light": light, "transmittance": transmittance}
+    arrays = {"weights": weights, "light": light, "transmittance": transmittance}
     arrays |= {"blocked_light": blocked_light, "mirrored_light": mirrored_light}
     count = common_batch(arrays)
-    sums = [wp.empty((count, filters.shape[1]), dtype=wp.vec3, device=filters.device) for _ in range(2)]
+    sums = [wp.empty((count, weights.shape[1]), dtype=wp.vec3, device=weights.device) for _ in range(2)]
     launch(
         _sum_lobes,
-        count * filters.shape[1],
+        count * weights.shape[1],
         inputs=[*arrays.values()],
         outputs=sums,
         shared=[array for array in arrays.values() if array is not None and len(array) < count],
-        cost=_COST * filters.shape[2],
+        cost=_COST * weights.shape[2],
     )
     return LobeLight(*sums)
 

@@ -92,7 +92,7 @@ def find_sun_transmittance(
 
 @wp.func
 def _disc_density(slope_square: float, disc: float):
-    """F, of d² and q²."""
+    """The term F of the formula, by d² and q²."""
     difference = slope_square + 1.0 - disc
     root = wp.sqrt(difference * difference + 4.0 * disc)
     if difference > 0.0:

@@ -29,26 +29,26 @@ wp.set_module_options({"max_unroll": 1})
 
 @wp.func(inline=True)
 def _heights(normal: wp.vec3, x: Chunk, y: Chunk, z: Chunk, per_radius: float):
-    """Heights of cells over the horizon, from 0 to 1."""
+    """Heights of cells over the horizon, clamped to [0, 1]: the argument of H."""
     cosine = normal[0] * x + normal[1] * y + normal[2] * z
     return wp.min(wp.max(0.5 * per_radius * cosine + Chunk(0.5), Chunk(0.0)), Chunk(1.0))
 
 
 @wp.func(inline=True)
 def _horizon_weights(heights: Chunk):
-    """H of cells, and a little more, so that none is 0."""
+    """Weights H of cells, plus a little, so that none is 0."""
     return wp.cw_mul(wp.cw_mul(heights, heights), Chunk(3.0) - 2.0 * heights) + Chunk(_MIN_HORIZON_WEIGHT)
 
 
 @wp.func
 def horizon_weight(height: float):
-    """H of one cell, and a little more."""
+    """Weight H of one cell, plus the same."""
     return height * height * (3.0 - 2.0 * height) + _MIN_HORIZON_WEIGHT
 
 
 @wp.func(inline=True)
 def _kernels(direction: wp.vec3, x: Chunk, y: Chunk, z: Chunk, reach_cosine: float):
-    """√k of cells, but for ε."""
+    """Square roots of the kernel k of cells, without ε."""
     return wp.max(direction[0] * x + direction[1] * y + direction[2] * z - Chunk(reach_cosine), Chunk(0.0))
 
 

@@ -17,17 +17,16 @@ and likewise to the other sides:
         ├───t────●────½──┼──½──●────½──┼──½──●───t───┤
       c_edge     c             c             c     c_edge
 
-These steps add up along a row to the color at the surface's right edge minus that at its left, which the moving edges
-contribute with the other sign. So the two cancel, as they must, if
+These steps add up along a row to the color at the surface's right edge minus that at its left, and the moving edges
+contribute the opposite. A body that moves in its own light shows the same sum wherever it is, so the two must cancel.
+They do, since
 
-- the step to an edge follows the edge's point, and
-- a sample counts along a row as far as its surface reaches there: 1, ½ + t beside an edge, t + t′ between two.
-  The smoothed image weighs it once for both axes; so slopes are multiplied by extent / weight.
+- a step to an edge moves as the edge's point does, which under a rotation is not how the sample's own point moves;
+- a sample counts along a row as far as its surface reaches there, its extent: 1; ½ + t beside one edge; t + t′ between
+  two. That is the length of its steps, so extent times slope are the steps, and half steps of neighbors are whole ones.
+  The smoothed image weighs a sample once for both axes, so slopes are multiplied by extent / weight.
 
-*Near* an outline, up to :data:`REACH` steps from it, mean slopes also replace exact derivatives, which are kept
-elsewhere: of samples that are receivers themselves, and of the albedo of vertices or a texture, for its detail. Towards
-a limb an exact slope is often tiny and rarely huge, and does not match the colors at the edges. Color is a product,
-light times albedo, of which either factor moves or both do.
+Near outlines mean slopes also replace exact derivatives (:mod:`.outlines`).
 
 | gradients of a ball of metal | without it | with it | differences of images |
 | --- | --- | --- | --- |
@@ -42,42 +41,29 @@ from dataclasses import replace
 import warp as wp
 
 from warpshadow.device.batch import instance_in, rows
-from warpshadow.device.launch import differentiable, launch, without_gradient
-from warpshadow.device.memory import copied, reshaped, zeros
+from warpshadow.device.launch import launch, without_gradient
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import record_adjoint
 from warpshadow.stages.image.film import sample_radiance
+from warpshadow.stages.image.outlines import distance_to_end
 from warpshadow.stages.raster.interpolation import interpolate, interpolate_values_adjoint, interpolate_weights_adjoint
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.screen import (
     direction_sign,
-    ends_before,
     half_size,
     has_neighbor,
-    line_distance,
     neighbor,
     relative_to_ray,
     relative_to_ray_adjoint,
     sample_center,
 )
-from warpshadow.stages.receivers.quadtree import Quadtree
 from warpshadow.stages.silhouettes.areas import LineArea
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import Silhouettes
-from warpshadow.stages.silhouettes.lines import (
-    NOTHING,
-    FragmentArrays,
-    edge_position_adjoint,
-    line_between,
-    make_fragment_arrays,
-)
+from warpshadow.stages.silhouettes.lines import FragmentArrays, edge_position_adjoint, make_fragment_arrays
 from warpshadow.stages.silhouettes.smooth import find_image_weight
 
-MIN_DISTANCE = 0.02  # distance of an edge [samples] below which rounding outweighs how color changes on the way to it
-
 MIN_WEIGHT = 0.25  # of a sample in the smoothed image, by which its slopes are divided
-
-REACH = 2  # steps from outlines up to which samples have mean slopes: farther in these would lose detail of textures
 
 _COST = 20.0  # nanoseconds that the gradient of a sample takes
 
@@ -98,154 +84,6 @@ def _face_slope(values: wp.vec3, corners: wp.vec3i, center: wp.vec2, clip_positi
     slope = values[0] * normal_a + values[1] * normal_b + values[2] * normal_c
     slope = (slope - slope[2] / normal_sum[2] * normal_sum) / normal_sum[2]
     return wp.vec2(slope[0], slope[1])
-
-
-@wp.func
-def _distance_to_end(
-    fragments: FragmentArrays, entries: wp.array(dtype=wp.int32), edges: wp.array2d(dtype=wp.vec2i), sample: int, k: int
-):
-    """Distance at which a sample's surface ends before its neighbor in direction k [samples].
-
-    −1 if no edge is known between them; −2 if the neighbor sees another surface or nothing, or is outside.
-    """
-    if not has_neighbor(sample, k, fragments.width, fragments.height):
-        return -2.0
-    entry = entries[sample]
-    if entry >= 0:
-        edge = edges[entry, k]
-        if edge[0] != NOTHING:
-            if edge[0] >= 0:
-                line = line_between(fragments, sample, k, edge)
-                t = line_distance(line, k, half_size(fragments.width, fragments.height))
-                if ends_before(line, k) and t > MIN_DISTANCE and t <= 1.0:
-                    return t
-            return -2.0
-    return wp.where(fragments.face_ids[neighbor(sample, k, fragments.width)] >= 0, -1.0, -2.0)
-
-
-@wp.func
-def _mark_mean_slope(
-    fragments: FragmentArrays,
-    entries: wp.array(dtype=wp.int32),
-    edges: wp.array2d(dtype=wp.vec2i),
-    sides: wp.array(dtype=wp.int32),
-    keys: wp.array(dtype=wp.int32),
-    has_mean_slope: wp.array(dtype=wp.bool),
-    sample: int,
-):
-    """Let a sample have a mean slope if slopes along both axes are known, and it is in no square."""
-    if not has_mean_slope[sample]:
-        is_known = bool(True)
-        if keys:
-            is_known = keys[sides[sample]] < 0
-        for axis in range(2):
-            forward = _distance_to_end(fragments, entries, edges, sample, 2 * axis)
-            backward = _distance_to_end(fragments, entries, edges, sample, 2 * axis + 1)
-            is_known = is_known and wp.max(forward, backward) > -2.0
-        if is_known:
-            has_mean_slope[sample] = True
-
-
-@wp.kernel(enable_backward=False)
-def _find_outline_samples(
-    # in
-    samples: wp.array(dtype=wp.int32),
-    fragments: FragmentArrays,
-    entries: wp.array(dtype=wp.int32),
-    edges: wp.array2d(dtype=wp.vec2i),
-    sides: wp.array(dtype=wp.int32),
-    keys: wp.array(dtype=wp.int32),
-    reach: int,
-    # out
-    has_mean_slope: wp.array(dtype=wp.bool),
-):
-    """A thread owns an entry: if its surface ends there, that and samples up to ``reach`` steps away on the surface.
-
-    All are False before. Threads that write to the same place write the same.
-    """
-    sample = samples[wp.tid()]
-    is_at_outline = bool(False)
-    if sample >= 0:
-        for k in range(4):
-            is_at_outline = is_at_outline or _distance_to_end(fragments, entries, edges, sample, k) > 0.0
-    if is_at_outline:
-        _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, sample)
-        for k in range(4):
-            on_path = sample
-            steps = int(0)
-            while steps < reach and _distance_to_end(fragments, entries, edges, on_path, k) == -1.0:
-                on_path = neighbor(on_path, k, fragments.width)
-                steps += 1
-                _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, on_path)
-                for turn in range(2):
-                    direction = wp.where(k < 2, 2, 0) + turn
-                    end = on_path
-                    further_steps = steps
-                    while further_steps < reach and _distance_to_end(fragments, entries, edges, end, direction) == -1.0:
-                        end = neighbor(end, direction, fragments.width)
-                        further_steps += 1
-                        _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, end)
-
-
-def find_outline_samples(
-    silhouettes: Silhouettes, clip_positions: wp.array, quadtree: Quadtree | None = None
-) -> wp.array:
-    """Find the samples that follow their surface by mean slopes although they are receivers.
-
-    Args:
-        silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`.
-        clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex].
-        quadtree: Squares in which samples interpolate, which none of these does; None for none.
-    Returns:
-        bool of shape [view, sample].
-
-    Not differentiable.
-    """
-    fragments = silhouettes.fragments
-    sides = fragments.face_ids if fragments.sides is None else fragments.sides
-    has_mean_slope = zeros(rows(sides).shape, dtype=wp.bool, device=sides.device)
-    arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
-    keys = None if quadtree is None else quadtree.square_key_of_side
-    inputs = [silhouettes.samples, arrays, silhouettes.entries, silhouettes.edges, reshaped(sides, (-1,)), keys, REACH]
-    launch(_find_outline_samples, silhouettes.samples.size, inputs=inputs, outputs=[reshaped(has_mean_slope, (-1,))])
-    return has_mean_slope
-
-
-@wp.kernel(enable_backward=False)
-def _add_gradients_of_points(
-    # in
-    has_mean_slope: wp.array2d(dtype=wp.bool),
-    adj_held: wp.array2d(dtype=wp.vec3),
-    # out
-    adj_barycentrics: wp.array2d(dtype=wp.vec3),
-):
-    """A thread owns a sample."""
-    view, sample = wp.tid()
-    if not has_mean_slope[view, sample]:
-        adj_barycentrics[view, sample] += adj_held[view, sample]
-
-
-def detach_near_outlines(fragments: Fragments, has_mean_slope: wp.array) -> Fragments:
-    """Fragments by which a color moves with its point, but at samples where its mean slope tells how it moves.
-
-    Args:
-        has_mean_slope: Of :func:`find_outline_samples`.
-
-    Differentiable: barycentrics of the other samples.
-    """
-    barycentrics = fragments.barycentrics
-    held_barycentrics = differentiable(
-        lambda _: None,
-        lambda adj_held: launch(
-            _add_gradients_of_points,
-            has_mean_slope.shape,
-            inputs=[has_mean_slope, rows(adj_held)],
-            outputs=[rows(barycentrics.grad)],
-        ),
-        copied(barycentrics),
-        [barycentrics],
-    )
-    return replace(fragments, barycentrics=held_barycentrics)
 
 
 @wp.struct
@@ -316,7 +154,7 @@ def _measure_steps(
     for direction in range(4):
         axis = direction / 2
         sign = direction_sign(direction)
-        distance = _distance_to_end(fragments, entries, edges, fragment, direction)
+        distance = distance_to_end(fragments, entries, edges, fragment, direction)
         other = neighbor(sample, direction, fragments.width)
         if distance > 0.0:
             step = image.edge_colors[entries[fragment], direction] - image.colors[sample]

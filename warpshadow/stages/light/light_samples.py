@@ -63,7 +63,7 @@ def sample_map(radiance: np.ndarray, count: int, *, seed: int = 0) -> LightSampl
 
 
 def _invert_distribution(distribution: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Interval of a rising distribution function that each value falls into, and where in it, from 0 to 1."""
+    """Interval of a rising distribution function for each value, and the value's position in it, 0 to 1."""
     interval = np.minimum(np.searchsorted(distribution, values, side="right"), len(distribution) - 1)
     interval_start = np.where(interval > 0, distribution[interval - 1], 0.0)
     return interval, np.clip(
@@ -136,7 +136,7 @@ def cut_map(
 
 
 def _resize_map(radiance: np.ndarray) -> np.ndarray:
-    """The map with :data:`_MIN_ROWS` or more: pixels are cut; and with not many more, where they are averaged."""
+    """Resize a map to :data:`_MIN_ROWS` rows or more by repeating pixels, and from many rows by averaging them."""
     height = len(radiance)
     if height < _MIN_ROWS:
         repeat_count = -(-_MIN_ROWS // height)
@@ -155,7 +155,7 @@ def _resize_map(radiance: np.ndarray) -> np.ndarray:
 def _cut_rectangle(
     table: np.ndarray, rows: np.ndarray, columns: np.ndarray, count: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Cut a rectangle of a map, from one place to another along each axis, into a number of equal importance.
+    """Cut a rectangle of a map, between two places along each axis, into rectangles of equal importance.
 
     Args:
         table: Importance of all above and left of each corner of pixels, [height + 1, width + 1].
@@ -186,7 +186,7 @@ def _cut_rectangle(
 
 
 def _interpolate_axis(values: np.ndarray, position: float) -> np.ndarray:
-    """Values of the first axis at a place between its items."""
+    """Interpolate values along the first axis at a fractional index."""
     item = min(int(position), len(values) - 2)
     return values[item] + (position - item) * (values[item + 1] - values[item])
 

@@ -234,7 +234,7 @@ def _light_of_chunk(transfer: Chunk, light: Chunk):
 
 @wp.func_grad(_light_of_chunk)
 def _light_of_chunk_adjoint(transfer: Chunk, light: Chunk, adj_light: Chunk):
-    """The gradient to transfer alone: light is known."""
+    """Adjoint by transfer alone, since light is known."""
     wp.adjoint[transfer] += wp.cw_mul(light, adj_light)
 
 

@@ -273,7 +273,7 @@ def sh_product(visibility: wp.array, lobes: wp.array, *, order: int, bands: int 
 
 @wp.func(inline=True)
 def broadcast_normal(normal: wp.vec3):
-    """A normal's coordinates, each for all cells of a chunk."""
+    """Coordinates of a normal, each repeated for the cells of a chunk."""
     return Chunk(normal[0]), Chunk(normal[1]), Chunk(normal[2])
 
 
@@ -300,7 +300,7 @@ def transfer_chunk_adjoint(
 
 
 def prepare_cells(transmittance: wp.array, normals: wp.array, directions: np.ndarray) -> list[Any]:
-    """Check transmittance towards cells; it in chunks, normals, directions and the cells' solid angle over π."""
+    """Check transmittance to cells; return it in chunks, normals, directions, and the cells' solid angle over π."""
     count, device = len(directions), normals.device
     check_count("directions", count)
     check.shape("transmittance", transmittance.shape, (*normals.shape, count))

@@ -149,7 +149,7 @@ def find_local_receiver_adjoint(
 def front_of(
     front_weights: wp.array3d(dtype=wp.float32), grid: PlaneGrid, height: float, batch: int, receiver: int, plane: int
 ):
-    """Part of the front that a receiver sees, as it is given or by its height."""
+    """Weight of the front that a receiver sees, given or by its height."""
     if front_weights:
         return front_weights[batch, receiver, plane]
     return front_weight(grid, height)
@@ -176,13 +176,13 @@ def front_of_adjoint(
 
 @wp.func
 def front_weight(grid: PlaneGrid, height: float):
-    """Part of the front that a receiver sees; of the back it sees the rest."""
+    """Weight of the front that a receiver at a height sees; the back has the rest."""
     return wp.smoothstep(-1.0, 1.0, 1.0 + 2.0 * height / grid.margin)
 
 
 @wp.func
 def front_weight_slope(grid: PlaneGrid, height: float):
-    """Its derivative."""
+    """Derivative of :func:`front_weight` by the height."""
     return smoothstep_slope(1.0 + 2.0 * height / grid.margin) * 2.0 / grid.margin
 
 
@@ -257,13 +257,13 @@ class MipFootprint:
 
 @wp.func
 def is_covered_by_texels(grid: PlaneGrid):
-    """Whether texels say how much of a footprint the mesh covers."""
+    """Whether the covered share of a footprint is that of its texels."""
     return grid.is_covered_by_texels == 1
 
 
 @wp.func
 def find_mip_footprint(grid: PlaneGrid, planes: PlaneArrays, footprint: PlaneFootprint):
-    """Find where in the mip levels of a grid a footprint lies."""
+    """Find the mip level and the texels of a footprint."""
     mip = MipFootprint()
     x = footprint.center[0] * grid.per_spread
     y = footprint.center[1] * grid.per_spread
@@ -292,7 +292,7 @@ def _log_slope(z: float):
 
 @wp.struct
 class _Corners:
-    """Four texels of a level around a footprint, and where it lies between them."""
+    """The four texels of a level around a footprint, and its position between them."""
 
     upper_left: int  # the left one above
     lower_left: int
@@ -339,7 +339,7 @@ def _interpolate_corners(texels: wp.array(dtype=wp.vec3), corners: _Corners):
 
 @wp.func
 def _interpolation_slopes(texels: wp.array(dtype=wp.vec3), corners: _Corners, adj_value: wp.vec3):
-    """Slopes of the dot product with a color, by the texel of the finest level."""
+    """Slopes of the dot product with a color by the position, in texels of the finest level."""
     a = wp.dot(adj_value, texels[corners.upper_left])
     b = wp.dot(adj_value, texels[corners.upper_left + corners.column_step])
     c = wp.dot(adj_value, texels[corners.lower_left])

@@ -101,7 +101,7 @@ def horizon_normal(horizon_normals: wp.array2d(dtype=wp.vec3), batch: int, recei
 
 @wp.func
 def is_above_horizon(normal: wp.vec3, direction: wp.vec3):
-    """Whether a direction is above the horizon of a normal; it is for the normal 0."""
+    """Whether a direction is above the horizon of a normal; the normal 0 has none."""
     return wp.dot(normal, direction) > 0.0 or wp.length_sq(normal) == 0.0
 
 

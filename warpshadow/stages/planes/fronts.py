@@ -92,7 +92,7 @@ def _over_margin_adjoint(height: float, margin: float, adj_result: float):
 
 @wp.func
 def _find_extremes(corners: wp.array(dtype=wp.vec3), first: int, end: int, axis: wp.vec3):
-    """The lowest and the highest of some corners along an axis; which these are has no gradient."""
+    """Indices of the lowest and the highest corner along an axis; not differentiable."""
     lowest_corner, highest_corner = int(first), int(first)
     minimum, maximum = float(0.0), float(0.0)
     for corner in range(first + 1, end):
@@ -233,7 +233,7 @@ def _find_fronts(
 
 
 class PlaneFronts(NamedTuple):
-    """On which side of planes receivers are."""
+    """Sides of planes on which receivers are."""
 
     front_weights: wp.array  # float32 of shape [batch, receiver, plane], from 1 in front of it to 0 behind it
     lifted_points: wp.array  # the receivers, lifted off the planes in which they lie, vec3 of shape [batch, receiver]

@@ -169,7 +169,7 @@ def _halvings(height: int, width: int) -> list[tuple[csr_matrix, csr_matrix, tup
 
 
 def _means(fine: int, coarse: int) -> csr_matrix:
-    """Means of ``fine`` equal texels in ``coarse`` ones of the same length in all."""
+    """Matrix of means of ``fine`` equal texels over ``coarse`` equal texels of the same whole."""
     from scipy.sparse import csr_matrix
 
     edges = np.arange(coarse + 1) * fine / coarse
@@ -179,7 +179,7 @@ def _means(fine: int, coarse: int) -> csr_matrix:
 
 
 def _shifted(matrix: csr_matrix, first: int, count: int) -> csr_matrix:
-    """The matrix as part of one with ``count`` columns, from the column ``first`` on."""
+    """Move a matrix to the column ``first`` of one with ``count`` columns."""
     from scipy.sparse import csr_matrix
 
     return csr_matrix((matrix.data, matrix.indices + first, matrix.indptr), shape=(matrix.shape[0], count))
@@ -198,7 +198,7 @@ def _kernel_grid(body: PlaneBody, first_level: int, level_count: int, first_edge
 
 
 def _frame_matrix(body: PlaneBody, vertex_count: int) -> csr_matrix:
-    """Rows that combine three vertices, far apart, to a plane's origin and axes."""
+    """Matrix of a plane's origin and axes by three of its vertices, far apart."""
     from scipy.sparse import csr_matrix
 
     vertices = np.unique(body.faces)

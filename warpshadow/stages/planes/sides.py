@@ -41,7 +41,7 @@ class PlaneInputs:
 def plane_inputs(
     points: wp.array, frames: wp.array, front_weights: wp.array | None, planes: PlaneArrays
 ) -> PlaneInputs:
-    """Put receivers together with the planes around them, for kernels."""
+    """Combine receivers and the planes around them for kernels."""
     inputs = PlaneInputs()
     inputs.points, inputs.frames, inputs.planes = points, frames, planes
     if front_weights is not None:
@@ -51,7 +51,7 @@ def plane_inputs(
 
 @wp.struct
 class StoredSide:
-    """A side that a receiver sees, as it is stored, with its gradients."""
+    """A side in scratch memory, with its gradients."""
 
     plane: int  # its number
     is_back: wp.bool
@@ -224,7 +224,7 @@ def _with_side(
     local_receiver: LocalReceiver,
     receiver: PlaneReceiver,
 ):
-    """Store a side with its outline if some of it is there; returns how many sides are stored."""
+    """Store a side and its outline if its weight is not 0; return the number of stored sides."""
     if weight <= 0.0:
         return receiver.side_count
     side = StoredSide()
@@ -342,7 +342,7 @@ def footprint_on_side_adjoint(
     adj_mip: wp.vec3,
     sides: wp.array(dtype=StoredSide),
 ):
-    """Add to those of the local receiver the gradients of :func:`.cells.fetch`; returns that of the direction."""
+    """Add the gradients of :func:`.cells.fetch` to those of the local receiver; return that of the direction."""
     adj_cosine = -0.5 * footprint.per_cosine * adj_mip[2]  # texels are as wide as t / √c′
     adj_distance = float(0.0)
     if adj_mip[2] != 0.0:
@@ -392,7 +392,7 @@ def inverse_distance_on_side_adjoint(
 def outline_coverage_on_side(
     planes: PlaneArrays, side: PlaneSide, cell: VisibleCell, edges: wp.array(dtype=ViewedEdge)
 ):
-    """Coverage (h, μ) of a cell by the outline of a plane, as much of it as is seen of the side."""
+    """Coverage (h, μ) of a cell by the outline of a plane, times the weight of its side."""
     side_normal = _side_normal(side)
     if wp.dot(side_normal, cell.direction) <= -planes.radius:
         return wp.vec4()

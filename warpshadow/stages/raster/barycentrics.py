@@ -103,7 +103,7 @@ def _find_barycentrics(
 
 
 def find_barycentrics(face_ids: wp.array, faces: wp.array, clip_positions: wp.array) -> wp.array:
-    """Find where on its face the center of each sample lies.
+    """Find the barycentrics of each sample's center on its face.
 
     Args:
         face_ids: Visible face or -1, int32, shape [batch, height, width].

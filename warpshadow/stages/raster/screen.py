@@ -97,7 +97,7 @@ def ray_volumes(a: wp.vec3, b: wp.vec3, c: wp.vec3):
 
 @wp.func
 def volume_rates(a: wp.vec4, b: wp.vec4, c: wp.vec4, position: wp.vec2, step: wp.vec2):
-    """By how much the volumes of `ray_volumes` change with a step to the right and one down, as shares of their sum.
+    """Changes of the volumes of `ray_volumes` over their sum, by a step to the right and one down.
 
     A value that is linear on the face, Σ v_i value_i / Σ v_i, changes by Σ rate_i (value_i − value). ``a``, ``b`` and
     ``c`` are the vertices in clip space.

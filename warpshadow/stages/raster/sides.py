@@ -28,7 +28,7 @@ def split_side(number: int, count: int):
 
 @wp.func
 def join_side(index: int, is_back: bool, count: int):
-    """Number of a face or vertex among ``count``, seen from the front or from behind: `split_side` the other way."""
+    """Number of the front or back of a face or vertex among ``count``: the inverse of `split_side`."""
     return wp.where(is_back, index + count, index)
 
 

@@ -122,7 +122,7 @@ def _quasi_random(shift: wp.uint32, step: wp.uint32, number: int):
 
 @wp.func
 def _cosine_to_sky(surfaces: _SurfaceArrays, shell: wp.vec4, point: wp.vec3, normal: wp.vec3, direction: wp.vec3):
-    """How much a point gets of the radiance of a direction of the sky, 0 where it is blocked."""
+    """Cosine at a point of a direction of the sky, times the shell's factor w; 0 where the direction is blocked."""
     beam = beam_to_shell(shell, point, direction)
     light_direction = wp.vec3(beam[0], beam[1], beam[2])
     cosine = beam[3] * wp.dot(normal, light_direction)

@@ -187,7 +187,7 @@ def find_light_shares(
 
 
 class Corners(NamedTuple):
-    """Receivers around others in an image."""
+    """Receivers at the corners of squares around others in an image."""
 
     receivers: np.ndarray
     """Four for each receiver, −1 for none, int of shape [receiver, 4]; these four have none themselves."""
@@ -195,7 +195,7 @@ class Corners(NamedTuple):
 
     @classmethod
     def none(cls, count: int) -> "Corners":
-        """No corners of any receiver."""
+        """Make corners of receivers that have none."""
         return cls(np.full((count, 4), -1), np.zeros((count, 4)))
 
 
@@ -314,7 +314,7 @@ class _Tracing:
     def take_over(
         self, corner_visibility: wp.array, corner_rows: np.ndarray, weights: np.ndarray, tolerances: np.ndarray
     ) -> None:
-        """Let receivers take over the visibility of their corners, by row, in later calls."""
+        """Interpolate visibility in later calls between receivers' corners, given as rows of ``corner_visibility``."""
         dtypes = zip((corner_rows, weights, tolerances), (wp.vec4i, wp.vec4, wp.float32), strict=True)
         self._corners = (
             *(wp.array(values, dtype=dtype, device=corner_visibility.device) for values, dtype in dtypes),

@@ -101,7 +101,7 @@ def packets_of(directions: np.ndarray) -> np.ndarray:
 
 
 def _bounds(count: int, level: int) -> np.ndarray:
-    """First faces of the boxes of a level, and the end of the last: their counts differ by at most one."""
+    """First face of each box of a level, and the end; counts of faces differ by at most one."""
     return np.arange((1 << level) + 1) * count >> level
 
 

@@ -65,7 +65,7 @@ def _face_from_receiver(mesh: wp.uint64, face: int, point: wp.vec3, normal: wp.v
 
 @wp.func
 def _volumes(ray_direction: wp.vec3, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """Barycentrics of where a line meets the plane of a face, not normalized: of one sign where it meets the face."""
+    """Unnormalized barycentrics of a line on the plane of a face: of one sign if the line meets the face."""
     ray = wp.vec3d(ray_direction)
     return wp.vec3d(wp.dot(ray, wp.cross(c, b)), wp.dot(ray, wp.cross(a, c)), wp.dot(ray, wp.cross(b, a)))
 
@@ -78,7 +78,7 @@ def _is_hit(ray_direction: wp.vec3, a: wp.vec3d, face_normal: wp.vec3d, volumes:
 
 @wp.func
 def _nonzero_direction(ray_direction: wp.vec3):
-    """A ray's direction for the boxes, whose slabs need a slope."""
+    """Direction of a ray with no component of 0, since the slabs of boxes divide by them."""
     return wp.vec3(
         wp.where(ray_direction[0] == 0.0, 1.0e-20, ray_direction[0]),
         wp.where(ray_direction[1] == 0.0, 1.0e-20, ray_direction[1]),

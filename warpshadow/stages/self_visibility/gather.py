@@ -144,7 +144,7 @@ def _make_probe_functions(lanes: int) -> _ProbeFunctions:
 
     @wp.func
     def load_visibility(rows: Rows, uses_rays: int, index: int, tables: wp.array(dtype=BodyTable), body: int):
-        """S of a ray or coarse cell in a row of each receiver, from 0 to 1.
+        """Visibility S, 0 to 1, of a ray or coarse cell in one row for each receiver.
 
         The table is read at each lookup: held over all of them, it takes 12 registers more.
         """

@@ -131,7 +131,7 @@ def _load_kernel(kernels: ResamplingKernels, rotation: wp.mat33, direction: int)
 
 @wp.func
 def _profile(cosine: float, cos_radius: float):
-    """The kernel's profile x_k."""
+    """Profile x_k of a resampling kernel."""
     return wp.max(0.0, (cosine - cos_radius) / (1.0 - cos_radius))
 
 

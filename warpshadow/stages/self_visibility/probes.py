@@ -84,7 +84,7 @@ class VisibilityProbes(NamedTuple):
 
 
 def longest_edge(positions: np.ndarray, faces: np.ndarray, *, has_sample_receivers: bool) -> float:
-    """Longest edge that a body's pieces should have, where samples or only vertices of it are receivers."""
+    """Longest edge for a body's pieces, shorter where samples, not only vertices, are receivers."""
     corners = np.asarray(positions, np.float64)[faces]
     sides = corners - np.roll(corners, 1, axis=1)
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum() / 2
@@ -178,7 +178,7 @@ def _cut_faces(
 
 @wp.struct
 class ProbeTable:
-    """By which receivers of a body find their probes."""
+    """Pieces of a body, and the numbers of its vertices, faces and probes, by which its receivers find probes."""
 
     first_vertex: int  # of the body's vertices among all
     first_face: int  # likewise of its faces
@@ -272,7 +272,7 @@ def _find_sample_weights(
 
 
 class ProbeTables(NamedTuple):
-    """By which receivers of some bodies find their probes."""
+    """A :class:`ProbeTable` for each of some bodies."""
 
     tables: tuple[ProbeTable, ...]  # of each body
     table: wp.array  # the same on the device
@@ -301,9 +301,10 @@ class ProbeTables(NamedTuple):
     def of_vertices(
         self, vertices: wp.array, spans: Sequence[Span] = (), table_of_span: Sequence[int] = (0,)
     ) -> ProbeWeights:
-        """Weights of vertices and their backs, int32 of shape [receiver], indices among all vertices: batch 1.
+        """Find the probe weights of receivers at vertices, with a batch of 1.
 
         Args:
+            vertices: Indices among all vertices, backs after them, int32 of shape [receiver].
             spans: Of the receivers, by body; () for one of all.
             table_of_span: The number of each span's body among those of the tables.
         """
@@ -315,7 +316,7 @@ class ProbeTables(NamedTuple):
     def of_samples(
         self, fragments: Fragments, spans: Sequence[Span] = (), table_of_span: Sequence[int] = (0,)
     ) -> ProbeWeights:
-        """Weights of fragments: sides and barycentrics, [batch, receiver]. Differentiable: barycentrics."""
+        """Find the probe weights of receivers at fragments of sides [batch, receiver]. Differentiable: barycentrics."""
         sides, barycentrics = fragments.face_ids, fragments.barycentrics
         probe_weights = _empty_weights(len(sides), sides.shape[1], sides.device)
         inputs = [sides, barycentrics, self.face_count, *self._inputs(sides.shape[1], spans, table_of_span)]

@@ -49,29 +49,29 @@ def trace_seconds(rays: int, face_count: int, *, are_backs: bool = False) -> flo
 
 
 class VisibilityRows(NamedTuple):
-    """Self-visibility of the probes, and then of their backs."""
+    """Self-visibility of the probes of a body: a row for each, then for each of their backs."""
 
     bits: wp.array  # whether rays escape, ray r is bit r % 32 of word r / 32: uint32 of shape [row, ray / 32]
     cells: wp.array  # shares of coarse cells that are open, in 255ths: uint8 of shape [row, ray / 8]
 
     @property
     def ray_count(self) -> int:
-        """Rays of a probe."""
+        """Number of rays of a probe."""
         return 32 * self.bits.shape[1]
 
     def fill(self, others: "VisibilityRows", first: int) -> None:
-        """Copy other rows into some, from a row on."""
+        """Overwrite rows from number ``first`` on by others."""
         for array, other in zip(self, others, strict=True):
             wp.copy(array[first : first + len(other)], other)
 
     def dilated(self, dilation: np.ndarray) -> "VisibilityRows":
-        """Rows that copy other rows; numbers of rows, [row]."""
+        """Copy row ``dilation[row]`` to each row."""
         device = self.bits.device
         return VisibilityRows(*(wp.array(array.numpy()[dilation], device=device) for array in self))
 
 
 def ray_count(row_count: int) -> int:
-    """Rays of a probe of a body with so many rows, a power of two."""
+    """Number of rays of a probe if the body has ``row_count`` rows, a power of two."""
     count = RAYS
     while count > MIN_RAYS and row_count * count // 4 > MAX_MEMORY:
         count //= 2

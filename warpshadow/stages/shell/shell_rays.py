@@ -34,7 +34,7 @@ def center_of(shell: wp.vec4):
 
 @wp.func
 def beam_to_shell(shell: wp.vec4, point: wp.vec3, direction: wp.vec3):
-    """Direction from a point to the point of a shell in a direction from its center, and the factor w, in a vec4."""
+    """Direction from a point to the shell's point in a direction from its center, and the factor w, as a vec4."""
     beam = direction
     weight = float(1.0)
     if shell[3] > 0.0:

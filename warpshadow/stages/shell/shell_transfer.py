@@ -40,7 +40,7 @@ wp.set_module_options({"max_unroll": 1})
 
 @wp.struct
 class CellLookup:
-    """Cells of directions as they are looked up."""
+    """Table by which cells near a direction are looked up."""
 
     cells: wp.array(dtype=wp.vec3)  # unit vectors
     neighbors: wp.array2d(dtype=wp.int32)  # of each texel of an octahedron

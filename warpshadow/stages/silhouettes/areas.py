@@ -63,7 +63,7 @@ class LineArea:
 
 @wp.func
 def _area_beyond(distance: float, slope: float):
-    """The area e, given t and m."""
+    """Area e beyond a line, given t and m."""
     area = float(0.0)
     if distance <= 0.5 * (1.0 - slope):
         area = 0.5 - distance

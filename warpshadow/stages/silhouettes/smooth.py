@@ -93,7 +93,7 @@ def _make_blend(dtype: type) -> wp.Kernel:
 
 @functools.cache
 def _make_blend_adjoint(dtype: type) -> wp.Kernel:
-    """Make its adjoint."""
+    """Make the adjoint of the kernel of :func:`_make_blend`."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def blend_adjoint(

@@ -67,7 +67,7 @@ def level_matrices(height: int, width: int) -> Iterator[csr_matrix]:
 
 
 def _halving(fine_count: int, coarse_count: int) -> csr_matrix:
-    """Shares of the fine texels along a side in each coarse one: :func:`_shares`."""
+    """Matrix of the shares (:func:`_shares`) of fine texels along a side in coarse ones."""
     from scipy.sparse import csr_matrix
 
     coarse = np.arange(coarse_count)
@@ -99,7 +99,7 @@ class _Layout:
         self.device_level_counts = constant(np.array(self.level_counts), wp.int32, device)
 
     def steps(self, texture: int, coarsest: int | None) -> list[tuple[wp.vec3i, wp.vec3i]]:
-        """Each level of a texture with the next, coarser one, from the finest to the coarsest that is wanted."""
+        """Pairs of a level of a texture and the next coarser one, from the finest to the ``coarsest``, None for all."""
         level_count = self.level_counts[texture]
         if coarsest is not None:
             level_count = min(level_count, coarsest + 1)

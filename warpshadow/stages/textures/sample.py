@@ -61,19 +61,19 @@ def _split_level(width: float, level_count: int):
 
 @wp.func
 def _line_reach(count: float):
-    """Number of the outermost probe on either side."""
+    """Number of probes on either side of the middle one."""
     return int(wp.ceil(0.5 * (count - 1.0)))
 
 
 @wp.func
 def _find_probe_weight(probe: int, count: float):
-    """Weight of a probe among ``count``: the part of the line in its stretch, so outer ones fade in as it grows."""
+    """Weight of a probe among ``count``: its share of the line, so that outer probes fade in as the line grows."""
     return wp.min(0.5 * (count + 1.0) - float(wp.abs(probe)), 1.0)
 
 
 @wp.struct
 class _Cell:
-    """The four texels around a point of a level, and where it lies between them."""
+    """The four texels around a point of a level, and its position between them."""
 
     above_left: int
     above_right: int
@@ -85,7 +85,7 @@ class _Cell:
 
 @wp.func
 def _texel_position(level: wp.vec3i, uv: wp.vec2):
-    """Position of a uv in a level [texels], relative to the center of its first texel; it repeats outside of [0, 1]."""
+    """Position in a level [texels] of a uv, which repeats outside [0, 1]; relative to the center of the first texel."""
     x = (uv[0] - wp.floor(uv[0])) * float(level[1]) - 0.5
     y = (1.0 - (uv[1] - wp.floor(uv[1]))) * float(level[2]) - 0.5
     return wp.vec2(x, y)
@@ -93,7 +93,7 @@ def _texel_position(level: wp.vec3i, uv: wp.vec2):
 
 @wp.func
 def _repeated(texel: int, count: int):
-    """The texel among ``count`` that one outside of them repeats."""
+    """Index among ``count`` texels of one that may lie outside: texels repeat."""
     return (texel % count + count) % count
 
 

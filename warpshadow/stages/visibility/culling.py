@@ -180,7 +180,7 @@ def make_cull(has_horizon: bool, Task: type, lanes: int, has_footprints: bool = 
 
     @wp.func
     def cull(receivers: ReceiverLanes, bound: wp.vec4, traversal_index: int, candidates: int, task: Task):
-        """Returns the number of candidates that the bound may reach; 0 where it is wholly below the horizon."""
+        """Store the candidates that a bound may reach; return their number, 0 for a bound below the horizon."""
         count = int(0)
         cells = task.cells
         if bound[3] > 0.0:

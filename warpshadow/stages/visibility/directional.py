@@ -119,7 +119,7 @@ def _make_attenuate(lanes: int) -> wp.Function:
 
     @wp.func(inline=True)
     def attenuate(cap: Cap, slope: Lane, opacity: Lane, bundle: int, task: TransmittanceTask):
-        """Returns whether any light is left."""
+        """Multiply the transmittance of a bundle; return whether any light is left."""
         max_transmittance = Lane(0.0)
         direction = (task.first_bundle + bundle) * BUNDLE
         slot = bundle * BUNDLE

@@ -171,7 +171,7 @@ def _make_base(order: int, base: str, lanes: int) -> wp.Function:
         optimal: wp.array(dtype=wp.vec2),
         result: wp.array(dtype=Lane),
     ):
-        """The result may be the residual's own memory; the square, f̂ * f̂, is read for `quadratic` only."""
+        """Approximate exp(f̂); ``result`` may be the residual's memory, and `quadratic` alone reads the square f̂ * f̂."""
         constant, slope, _c, _s = factors(wp.cw_mul(scale, norm), optimal)
         first_power = wp.cw_mul(factor, scale)
         linear = wp.cw_mul(first_power, slope)

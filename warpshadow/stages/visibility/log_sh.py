@@ -40,7 +40,7 @@ _PAIR_COST = 0.25  # nanoseconds that a sphere costs for a receiver and a coeffi
 
 @functools.cache
 def _task_type(order: int, lanes: int) -> Any:
-    """Struct of a thread's work: a block's coefficients."""
+    """Struct of the coefficients of a thread's block."""
     Lane, Band = lane_type(lanes), band_type(order)
 
     @wp.struct

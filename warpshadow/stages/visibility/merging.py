@@ -41,7 +41,7 @@ _MAX_DISTANCE2 = 1.0e30  # (D/E)² is kept where its products are float32
 
 
 class ClusterNodes(NamedTuple):
-    """Spheres, and after them the spheres of their clusters; of the clusters there may be none."""
+    """Spheres and, after them, those of their clusters, if there are any."""
 
     centers: wp.array  # [batch, node] vec3
     radii: wp.array  # [batch, node] float32

@@ -36,7 +36,7 @@ _RECEIVER_COST, _CELL_COST = 40.0, 5.0  # nanoseconds that the cells of a receiv
 
 
 class SharpCells(NamedTuple):
-    """Sharp cells."""
+    """Sharp cells of a light, and their spots."""
 
     directions: np.ndarray  # unit vectors to where their light comes from, some repeated: [16, 3]
     slots: np.ndarray  # index of each cell among them, −1 for cells that are not sharp: [direction]

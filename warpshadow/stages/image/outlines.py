@@ -1,0 +1,172 @@
+"""Outlines: samples near them move by the mean slopes of :mod:`.slopes` where else derivatives are exact.
+
+Up to :data:`REACH` steps from an outline they replace exact derivatives, which samples keep elsewhere: those that are
+receivers themselves, and, for its detail, the albedo of vertices or a texture. Towards a limb an exact slope is often
+tiny and rarely huge, and does not match the colors at the edges. Color is a product, light times albedo, of which
+either factor moves or both do.
+"""
+
+from dataclasses import replace
+
+import warp as wp
+
+from warpshadow.device.batch import rows
+from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.memory import copied, reshaped, zeros
+from warpshadow.stages.raster.rasterization import Fragments
+from warpshadow.stages.raster.screen import ends_before, half_size, has_neighbor, line_distance, neighbor
+from warpshadow.stages.receivers.quadtree import Quadtree
+from warpshadow.stages.silhouettes.find import Silhouettes
+from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, line_between, make_fragment_arrays
+
+MIN_DISTANCE = 0.02  # distance of an edge [samples] below which rounding outweighs how color changes on the way to it
+
+REACH = 2  # steps from outlines up to which samples have mean slopes: farther in these would lose detail of textures
+
+
+@wp.func
+def distance_to_end(
+    fragments: FragmentArrays, entries: wp.array(dtype=wp.int32), edges: wp.array2d(dtype=wp.vec2i), sample: int, k: int
+):
+    """Distance at which a sample's surface ends before its neighbor in direction k [samples].
+
+    −1 if no edge is known between them; −2 if the neighbor sees another surface or nothing, or is outside.
+    """
+    if not has_neighbor(sample, k, fragments.width, fragments.height):
+        return -2.0
+    entry = entries[sample]
+    if entry >= 0:
+        edge = edges[entry, k]
+        if edge[0] != NOTHING:
+            if edge[0] >= 0:
+                line = line_between(fragments, sample, k, edge)
+                t = line_distance(line, k, half_size(fragments.width, fragments.height))
+                if ends_before(line, k) and t > MIN_DISTANCE and t <= 1.0:
+                    return t
+            return -2.0
+    return wp.where(fragments.face_ids[neighbor(sample, k, fragments.width)] >= 0, -1.0, -2.0)
+
+
+@wp.func
+def _mark_mean_slope(
+    fragments: FragmentArrays,
+    entries: wp.array(dtype=wp.int32),
+    edges: wp.array2d(dtype=wp.vec2i),
+    sides: wp.array(dtype=wp.int32),
+    keys: wp.array(dtype=wp.int32),
+    has_mean_slope: wp.array(dtype=wp.bool),
+    sample: int,
+):
+    """Let a sample have a mean slope if slopes along both axes are known, and it is in no square."""
+    if not has_mean_slope[sample]:
+        is_known = bool(True)
+        if keys:
+            is_known = keys[sides[sample]] < 0
+        for axis in range(2):
+            forward = distance_to_end(fragments, entries, edges, sample, 2 * axis)
+            backward = distance_to_end(fragments, entries, edges, sample, 2 * axis + 1)
+            is_known = is_known and wp.max(forward, backward) > -2.0
+        if is_known:
+            has_mean_slope[sample] = True
+
+
+@wp.kernel(enable_backward=False)
+def _find_outline_samples(
+    # in
+    samples: wp.array(dtype=wp.int32),
+    fragments: FragmentArrays,
+    entries: wp.array(dtype=wp.int32),
+    edges: wp.array2d(dtype=wp.vec2i),
+    sides: wp.array(dtype=wp.int32),
+    keys: wp.array(dtype=wp.int32),
+    reach: int,
+    # out
+    has_mean_slope: wp.array(dtype=wp.bool),
+):
+    """A thread owns an entry: if its surface ends there, that and samples up to ``reach`` steps away on the surface.
+
+    All are False before. Threads that write to the same place write the same.
+    """
+    sample = samples[wp.tid()]
+    is_at_outline = bool(False)
+    if sample >= 0:
+        for k in range(4):
+            is_at_outline = is_at_outline or distance_to_end(fragments, entries, edges, sample, k) > 0.0
+    if is_at_outline:
+        _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, sample)
+        for k in range(4):
+            on_path = sample
+            steps = int(0)
+            while steps < reach and distance_to_end(fragments, entries, edges, on_path, k) == -1.0:
+                on_path = neighbor(on_path, k, fragments.width)
+                steps += 1
+                _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, on_path)
+                for turn in range(2):
+                    direction = wp.where(k < 2, 2, 0) + turn
+                    end = on_path
+                    further_steps = steps
+                    while further_steps < reach and distance_to_end(fragments, entries, edges, end, direction) == -1.0:
+                        end = neighbor(end, direction, fragments.width)
+                        further_steps += 1
+                        _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, end)
+
+
+def find_outline_samples(
+    silhouettes: Silhouettes, clip_positions: wp.array, quadtree: Quadtree | None = None
+) -> wp.array:
+    """Find the samples that follow their surface by mean slopes although they are receivers.
+
+    Args:
+        silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`.
+        clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex].
+        quadtree: Squares in which samples interpolate, which none of these does; None for none.
+    Returns:
+        bool of shape [view, sample].
+
+    Not differentiable.
+    """
+    fragments = silhouettes.fragments
+    sides = fragments.face_ids if fragments.sides is None else fragments.sides
+    has_mean_slope = zeros(rows(sides).shape, dtype=wp.bool, device=sides.device)
+    arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
+    keys = None if quadtree is None else quadtree.square_key_of_side
+    inputs = [silhouettes.samples, arrays, silhouettes.entries, silhouettes.edges, reshaped(sides, (-1,)), keys, REACH]
+    launch(_find_outline_samples, silhouettes.samples.size, inputs=inputs, outputs=[reshaped(has_mean_slope, (-1,))])
+    return has_mean_slope
+
+
+@wp.kernel(enable_backward=False)
+def _detach_adjoint(
+    # in
+    has_mean_slope: wp.array2d(dtype=wp.bool),
+    adj_held: wp.array2d(dtype=wp.vec3),
+    # out
+    adj_barycentrics: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a sample."""
+    view, sample = wp.tid()
+    if not has_mean_slope[view, sample]:
+        adj_barycentrics[view, sample] += adj_held[view, sample]
+
+
+def detach_near_outlines(fragments: Fragments, has_mean_slope: wp.array) -> Fragments:
+    """Fragments by which a color moves with its point, but at samples where its mean slope tells how it moves.
+
+    Args:
+        has_mean_slope: Of :func:`find_outline_samples`.
+
+    Differentiable: barycentrics of the other samples.
+    """
+    barycentrics = fragments.barycentrics
+    held_barycentrics = differentiable(
+        lambda _: None,
+        lambda adj_held: launch(
+            _detach_adjoint,
+            has_mean_slope.shape,
+            inputs=[has_mean_slope, rows(adj_held)],
+            outputs=[rows(barycentrics.grad)],
+        ),
+        copied(barycentrics),
+        [barycentrics],
+    )
+    return replace(fragments, barycentrics=held_barycentrics)
