@@ -13,7 +13,7 @@ import math
 import os
 import struct
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -143,7 +143,7 @@ def _argument(kind: Any, field: Any, size: int) -> _Argument:
     return _Argument(lambda value: bytes(value if type(value) is field else field(*value)) + padding, None, 0, zeros)
 
 
-def _packed(arguments: Sequence[_Argument], values: Sequence[Any], *, are_gradients: bool = False) -> list[Any]:
+def _packed(arguments: Iterable[_Argument], values: Sequence[Any], *, are_gradients: bool = False) -> list[Any]:
     """Parts of the struct of a kernel's arguments, or of their gradients, one for each; any gradient may be None.
 
     Raises:
