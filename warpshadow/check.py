@@ -463,9 +463,10 @@ def shape(name: str, got: tuple[int, ...], expected: tuple[int | str, ...], mean
 
     If ``meaning`` is given, the message ends with it and with how to make such an array.
     """
-    matches = len(got) == len(expected) and all(
-        isinstance(length, str) or got_length == length for got_length, length in zip(got, expected, strict=True)
-    )
+    matches = len(got) == len(expected)
+    if matches and got != expected:
+        for got_length, length in zip(got, expected, strict=True):
+            matches &= got_length == length or isinstance(length, str)
     if not matches:
         lengths = ", ".join(map(str, expected))
         raise ValueError(f"{name}: got shape {tuple(got)}, expected [{lengths}]{meaning and f': {meaning}'}")

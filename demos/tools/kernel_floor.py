@@ -106,7 +106,7 @@ def stages(size: Size, rising: float, reached: float) -> list[Stage]:
         Stage("visibility, directional", "receiver", Work(s * pair, 24 + 4 * q, 4), Work(s * pair_back, 48 + 8 * q, 2)),
         Stage("transfer, directional", "receiver", Work(8 * q, 12 + 8 * q, 0), Work(20 * q, 24 + 24 * q, 0)),
         Stage("shading, directional", "receiver", Work(6 * q, 12 + 4 * q, 2), Work(6 * q, 12 + 8 * q, 1)),
-        Stage("albedo", "sample", Work(15, 40, 1), Work(15, 40, 1)),
+        Stage("albedo", "sample", Work(15, 40, 1), Work(0, 0, 0)),
         Stage("radiance", "sample", Work(20, 60, 1), Work(45, 92, 2)),
         Stage("smoothing", "sample", Work(60, 2 * 64 + 16 + 48, 2), Work(60, 64 + 2 * 16 + 64, 2)),
         Stage("slopes", "sample", Work(0, 0, 0), Work(160 + 6 * SPECIAL, 28 + 84, 0)),

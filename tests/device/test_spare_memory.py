@@ -32,11 +32,11 @@ def spare_memory(system, limit=2**40):
     return SpareMemory(system.take, system.give_back, limit=limit)
 
 
-@pytest.mark.parametrize("size", [1, 2**16, 2**16 + 1, 12345678, SIZE, SIZE + 1, 2**30, 2**30 + 1, 2**33])
+@pytest.mark.parametrize("size", [1, 256, 257, 2**16, 2**16 + 1, 12345678, SIZE, SIZE + 1, 2**30, 2**30 + 1, 2**33])
 def test_a_block_is_as_large_as_asked_for_and_little_larger(size):
     system = System()
     block = spare_memory(system).take(size)
-    assert size <= system.blocks[block] < 1.25 * size + 1
+    assert size <= system.blocks[block] < max(257, 1.25 * size)
 
 
 def test_a_block_serves_the_next_of_about_its_size_and_nobody_beside_it():
@@ -50,12 +50,26 @@ def test_a_block_serves_the_next_of_about_its_size_and_nobody_beside_it():
     assert spare.take(SIZE) not in (first, second)
 
 
-def test_small_and_huge_blocks_go_back_at_once():
+def test_huge_blocks_go_back_at_once():
     system = System()
     spare = spare_memory(system)
-    for size in (100, 2**32):
-        spare.give_back(spare.take(size), size)
+    spare.give_back(spare.take(2**32), 2**32)
     assert not system.blocks and spare.cached_bytes == 0
+
+
+def test_of_each_small_size_a_million_bytes_are_kept():
+    system = System()
+    spare = spare_memory(system, limit=0)
+    for size in (1000, 2**16):
+        blocks = [spare.take(size) for _ in range(2000)]
+        for block in blocks:
+            spare.give_back(block, size)
+    assert sorted(set(system.blocks.values())) == [1024, 2**16]
+    assert sum(system.blocks.values()) == 2 * 2**20
+    out = {spare.take(1024) for _ in range(3)}
+    assert len(out) == 3 and len(system.blocks) == 2**10 + 2**4  # no new ones
+    spare.clear()
+    assert set(system.blocks) == out
 
 
 def test_beyond_the_limit_all_go_back():

@@ -96,6 +96,29 @@ def kernels_take_their_arguments_as_warp_passes_them():
     assert all(map(np.array_equal, expected, found))
 
 
+@wp.struct
+class _Record:
+    missing: wp.array2d(dtype=wp.vec3)
+    scaled: _Scaled
+    is_shifted: bool
+    offset: wp.vec3
+    values: wp.array(dtype=wp.float32)
+
+
+def structs_are_as_if_their_fields_were_set():
+    values = wp.zeros(3, dtype=wp.float32, device="cpu", requires_grad=True)
+    scaled = warp_internals.struct_of(_Scaled, values=values, factor=0.5)
+    fields = {"missing": None, "scaled": scaled, "is_shifted": True, "offset": wp.vec3(1, 2, 3), "values": values}
+    expected, found = _Record(), warp_internals.struct_of(_Record, **fields)
+    for name, value in fields.items():
+        setattr(expected, name, value)
+    assert bytes(found.__ctype__()) == bytes(expected.__ctype__())
+    assert found._values_grad is values.grad and found.scaled.values is values and found.missing is None
+    for wrong in ({"values": None}, {"values": values, "factor": 1.0, "other": 2.0}, {"values": 1, "factor": 1.0}):
+        with pytest.raises(TypeError):
+            warp_internals.struct_of(_Scaled, **wrong)
+
+
 def a_module_that_was_unloaded_is_loaded_again():
     values = wp.zeros(4, dtype=wp.int32, device="cpu")
     for first in (1, 2):
@@ -174,6 +197,7 @@ def check(works):
     [
         a_thread_has_a_tape_of_its_own,
         kernels_take_their_arguments_as_warp_passes_them,
+        structs_are_as_if_their_fields_were_set,
         a_module_that_was_unloaded_is_loaded_again,
         arguments_of_a_wrong_type_are_refused,
         a_dtype_says_of_what_its_items_are,

@@ -13,7 +13,7 @@ import math
 import os
 import struct
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -143,7 +143,7 @@ def _argument(kind: Any, field: Any, size: int) -> _Argument:
     return _Argument(lambda value: bytes(value if type(value) is field else field(*value)) + padding, None, 0, zeros)
 
 
-def _packed(arguments: Sequence[_Argument], values: Sequence[Any], *, are_gradients: bool = False) -> list[Any]:
+def _packed(arguments: Iterable[_Argument], values: Sequence[Any], *, are_gradients: bool = False) -> list[Any]:
     """Parts of the struct of a kernel's arguments, or of their gradients, one for each; any gradient may be None.
 
     Raises:
@@ -160,6 +160,35 @@ def _packed(arguments: Sequence[_Argument], values: Sequence[Any], *, are_gradie
         else:
             raise TypeError
     return parts
+
+
+@functools.cache
+def _fields(kind: Any) -> dict[str, _Argument]:
+    """Fields of a struct, as they lie in it, by name."""
+    fields = kind.ctype._fields_
+    starts = [getattr(kind.ctype, name).offset for name, *_ in fields]
+    sizes = [end - start for start, end in itertools.pairwise([*starts, ctypes.sizeof(kind.ctype)])]
+    return {
+        name: _argument(kind.vars[name].type, field, size) for (name, field), size in zip(fields, sizes, strict=True)
+    }
+
+
+def struct_of(kind: Any, **values: Any) -> Any:
+    """Make a struct of the values of all its fields, as if they were set one by one, but quicker.
+
+    Raises:
+        TypeError: for a field that is missing or unknown, or an array of another type.
+    """
+    fields = _fields(kind)
+    if values.keys() != fields.keys():
+        raise TypeError(f"{kind.key}: got {sorted(values)}, expected {sorted(fields)}")
+    parts = _packed(fields.values(), [values[name] for name in fields])
+    instance = object.__new__(kind.instance_type)
+    instance.__dict__.update(values, _ctype=kind.ctype.from_buffer_copy(b"".join(parts)))
+    for name, value in values.items():
+        if type(value) is wp.array and value._grad is not None:
+            instance.__dict__[f"_{name}_grad"] = value._grad  # held, as Warp does
+    return instance
 
 
 @functools.lru_cache(maxsize=4096)
@@ -311,9 +340,13 @@ def empty(shape: int | Sequence[int], dtype: type, device: wp.DeviceLike) -> wp.
     pointer = _spare_memory.take(size) if size else None
     if size and not pointer:
         raise MemoryError(f"got no memory for an array of {size:,} bytes")
+    return _new_array(attributes, descriptor, pointer)
+
+
+def _new_array(attributes: dict[str, Any], descriptor: bytes, pointer: int | None) -> wp.array:
+    """Make an array of attributes and a descriptor of :func:`_cpu_array`, of the memory at an address."""
     array = object.__new__(wp.array)
-    fields = array.__dict__
-    fields.update(attributes)
+    array.__dict__ = fields = attributes.copy()  # quicker than an update
     fields["ptr"], fields["ctype"] = pointer, _types.array_t.from_buffer_copy(descriptor)
     fields["ctype"].data = pointer or 0
     return array
@@ -322,12 +355,9 @@ def empty(shape: int | Sequence[int], dtype: type, device: wp.DeviceLike) -> wp.
 def array_at(pointer: int, shape: Sequence[int], dtype: type, *, owner: Any) -> wp.array:
     """Make a contiguous CPU array of memory that belongs to another, an array or anything else that holds it."""
     attributes, descriptor, _ = _cpu_array(tuple(shape), dtype)
-    array = object.__new__(wp.array)
+    array = _new_array(attributes, descriptor, pointer)
     fields = array.__dict__
-    fields.update(attributes)
-    fields["ptr"], fields["ctype"], fields["deleter"] = pointer, _types.array_t.from_buffer_copy(descriptor), None
-    fields["ctype"].data = pointer
-    fields["_ref" if isinstance(owner, wp.array) else "owner"] = owner
+    fields["deleter"], fields["_ref" if isinstance(owner, wp.array) else "owner"] = None, owner
     return array
 
 

@@ -351,7 +351,10 @@ def test_backs_of_an_open_body_are_traced_once_they_are_seen(tmp_path, monkeypat
     shell = cup()
     open_below = ws.Mesh(shell.positions, shell.faces[shell.positions[shell.faces, 1].mean(axis=1) > -0.7])
 
-    def images(cache: str) -> tuple[list[np.ndarray], list[int]]:
+    def images(cache: str, *, are_read: bool) -> tuple[list[np.ndarray], list[tuple[int, bool]]]:
+        """Images, and after each how many files there are and whether it looked for backs."""
+        looks = []
+        monkeypatch.setattr(self_visibility, "is_readable", lambda device: looks.append(device) or are_read)
         monkeypatch.setenv("WARPSHADOW_CACHE_DIR", str(tmp_path / cache))
         mesh = ws.Mesh(open_below.positions, open_below.faces)  # nothing of it is in memory
         scene = scene_of(receivers)
@@ -362,14 +365,14 @@ def test_backs_of_an_open_body_are_traced_once_they_are_seen(tmp_path, monkeypat
             rotations = wp.array(half_turn @ poses.rotations.numpy(), dtype=wp.mat33)
             geometry = renderer.placed(Poses(rotations, poses.translations, poses.scales))
             found.append(renderer.draw(view=renderer.view(geometry)).numpy())
-            counts.append(len(cached_files("self_shadows")))
+            counts.append((len(cached_files("self_shadows")), bool(looks)))
+            looks.clear()
         return found, counts
 
-    some, counts = images("once seen")
-    assert counts == [1, 2, 2]
-    monkeypatch.setattr(self_visibility, "is_readable", lambda device: False)
-    all_of_them, counts = images("at once")
-    assert counts == [2, 2, 2]
+    some, counts = images("once seen", are_read=True)
+    assert counts == [(1, True), (2, True), (2, False)]
+    all_of_them, counts = images("at once", are_read=False)
+    assert counts == [(2, True), (2, False), (2, False)]
     np.testing.assert_array_equal(some, all_of_them)
     assert np.abs(some[0] - some[1]).max() > 0.1
 

@@ -132,6 +132,7 @@ class SelfVisibility:
         self._probes: dict[int, VisibilityProbes] = {}
         self._tables: dict[tuple[int, ...], ProbeTables] = {}
         self._rows: dict[int, VisibilityRows] = {}
+        self._bodies_with_backs: set[int] = set()  # open ones whose backs have rows
         self._lobes: dict[tuple[int, int], wp.array] = {}
         self._body_tables: dict[tuple[int, ...], BodyTables] = {}
 
@@ -342,11 +343,12 @@ class SelfVisibility:
 
         if self._merged_scene.is_two_sided[body]:
             self._cached_by_mesh(body, "backs", fill)
+            self._bodies_with_backs.add(body)
 
     def _trace_seen_backs(self, weights: ProbeWeights, spans: tuple[Span, ...]) -> None:
         """Fill the rows of backs if receivers lie on some, or if that cannot be read without waiting."""
         for body, first, end in spans:
-            if self._merged_scene.is_two_sided[body]:
+            if self._merged_scene.is_two_sided[body] and body not in self._bodies_with_backs:
                 count = len(self.probes(body).positions)
                 if not is_readable(self._merged_scene.device) or weights.rows.numpy()[:, first:end].max() >= count:
                     self._trace_backs(body)

@@ -1,12 +1,14 @@
 """Views: a geometry seen by cameras, wired from the vertices to the image."""
 
 import functools
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
 from warpshadow.assets.camera import Camera
+from warpshadow.device.launch import without_gradient
 from warpshadow.pipeline.bodies.reflectance import Materials, SampleReflectance
 from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached, field_of, identity
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
@@ -175,10 +177,13 @@ class View(ShadingContext):
     def _fragments_of_patterns(self, materials: Materials) -> tuple[Node, Node | None]:
         """Nodes of the fragments by which colors move, and of the samples whose colors have mean slopes instead.
 
-        None have them, and the latter is None, where nothing moves or each body has one color.
+        None have them, and the latter is None, where nothing moves or each body has one color, which moves by neither.
         """
-        if not (self._is_moving and materials.have_patterns):
+        if not self._is_moving:
             return self.fragments_node, None
+        if not materials.have_patterns:
+            make_node = functools.partial(Node, "", _detach_fragments, detached(self.fragments_node))
+            return self.cached("detached fragments", None, make_node), None
 
         def make_nodes() -> tuple[Node, Node]:
             seen = detached(self.silhouettes), detached(self.clip_positions)
@@ -389,6 +394,11 @@ class View(ShadingContext):
         which = f"image {number} of {len(face_ids)}" if len(face_ids) > 1 else "the image"
         remedy = 'Camera.framing(scene), or framing = "auto" in a scene file, shows all of it'
         return f"camera: {which} shows nothing of the scene: {reason}; {remedy}"
+
+
+def _detach_fragments(fragments: Fragments) -> Fragments:
+    """Fragments whose points pass no gradient on."""
+    return replace(fragments, barycentrics=without_gradient(fragments.barycentrics))
 
 
 def _radiance(receivers: Receivers, shading: wp.array, reflectance: wp.array) -> wp.array:

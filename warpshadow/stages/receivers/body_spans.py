@@ -16,6 +16,7 @@ from warpshadow.device.lanes import block_count
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
+from warpshadow.device.warp_internals import struct_of
 
 
 class Span(NamedTuple):
@@ -121,20 +122,19 @@ def receiver_spans(spans: Sequence[Span], receiver_count: int, lanes: int, devic
     ends = [span.end for span in spans] or [receiver_count]
     first_receivers = [0, *ends]
     counts = [block_count(end - first, lanes) for first, end in itertools.pairwise(first_receivers)]
-    result = ReceiverSpans()
-    result.receiver_count, result.block_count = receiver_count, sum(counts)
-    result.first_receivers = result.first_blocks = _no_numbers(device.alias)
-    if len(spans) > 1:
-        result.first_receivers = _put(first_receivers, device)
-        result.first_blocks = _put(list(itertools.accumulate(counts, initial=0)), device)
-    return result
+    are_many = len(spans) > 1
+    return struct_of(
+        ReceiverSpans,
+        receiver_count=receiver_count,
+        block_count=sum(counts),
+        first_receivers=_put(first_receivers if are_many else [], device),
+        first_blocks=_put(list(itertools.accumulate(counts, initial=0)) if are_many else [], device),
+    )
 
 
 def span_values(values: Sequence[int], device: wp.Device) -> SpanValues:
     """Give numbers of spans to a device."""
-    result = SpanValues()
-    result.single, result.values = values[0], _put(values, device) if len(values) > 1 else _no_numbers(device.alias)
-    return result
+    return struct_of(SpanValues, single=values[0], values=_put(values if len(values) > 1 else [], device))
 
 
 @functools.cache
@@ -161,6 +161,8 @@ def _write_numbers(
 
 def _put(numbers: Sequence[int], device: wp.Device) -> wp.array:
     """Give numbers to a device. A graph gets them as arguments of launches: it has other receivers than plain calls."""
+    if not numbers:
+        return _no_numbers(device.alias)
     if not device.is_capturing:
         return constant(np.array(numbers, np.int32), wp.int32, device)
     result = empty(len(numbers), dtype=wp.int32, device=device)

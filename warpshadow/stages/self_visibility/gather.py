@@ -28,6 +28,7 @@ from warpshadow.device.lanes import (
 from warpshadow.device.launch import launch, launch_with_adjoint
 from warpshadow.device.memory import as_items, empty, require_gradient
 from warpshadow.device.parallel import Scratch, scratch_slot
+from warpshadow.device.warp_internals import struct_of
 from warpshadow.device.warp_sums import sum_over_warp
 from warpshadow.stages.receivers.body_spans import (
     ReceiverBlock,
@@ -376,12 +377,18 @@ def gather_self_transmittance(
         # each instance has a gradient of its own
         probe_weights = ProbeWeights(probe_weights.rows, expand(probe_weights.weights, batch_count))
     lanes = lane_count(device)
-    inputs = GatherInputs()
-    inputs.normals, inputs.rows, inputs.probe_weights = normals, *probe_weights
-    inputs.spans = receiver_spans(spans, shape[1], lanes, device)
-    inputs.table_of_span = span_values(table_of_span, device)
-    inputs.directions, inputs.kernels, inputs.tables = directions, kernels.table, tables.table
-    inputs.counts, inputs.indices, inputs.weights = resampling_weights
+    inputs = struct_of(
+        GatherInputs,
+        normals=normals,
+        spans=receiver_spans(spans, shape[1], lanes, device),
+        table_of_span=span_values(table_of_span, device),
+        rows=probe_weights.rows,
+        probe_weights=probe_weights.weights,
+        directions=directions,
+        **resampling_weights._asdict(),
+        kernels=kernels.table,
+        tables=tables.table,
+    )
     lookup_count = _MEAN_LOOKUPS * direction_count * lanes
     cell_count = max(direction_count, *(rows.cells.shape[1] for rows in tables.rows)) if lanes > 1 else 1
     return launch_with_adjoint(

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warpshadow.device.warp_internals import struct_of
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.screen import (
     face_plane,
@@ -29,11 +30,17 @@ class FragmentArrays:
 
 def make_fragment_arrays(fragments: Fragments, faces: wp.array, clip_positions: wp.array) -> FragmentArrays:
     """Fragments of rasterized faces of vertices in clip space."""
-    arrays = FragmentArrays()
-    arrays.face_ids, arrays.barycentrics = fragments.flat
-    arrays.faces, arrays.clip_positions = faces, clip_positions
-    _, arrays.height, arrays.width = fragments.face_ids.shape
-    return arrays
+    face_ids, barycentrics = fragments.flat
+    _, height, width = fragments.face_ids.shape
+    return struct_of(
+        FragmentArrays,
+        face_ids=face_ids,
+        barycentrics=barycentrics,
+        faces=faces,
+        clip_positions=clip_positions,
+        width=width,
+        height=height,
+    )
 
 
 @wp.func

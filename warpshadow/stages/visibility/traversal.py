@@ -14,6 +14,7 @@ import warp as wp
 from warpshadow.device.lanes import lane_count, lane_type, make_lane_functions, vectors_type
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
+from warpshadow.device.warp_internals import struct_of
 from warpshadow.stages.receivers.body_spans import (
     ReceiverSpans,
     Span,
@@ -177,17 +178,24 @@ def prepare_traversal(
     for skip in skips:
         if not 0 <= skip[0] <= skip[1] <= count:
             raise ValueError(f"skips: got {skip!r}, expected a first and an end of {count} spheres")
-    nodes, *bounds = find_clusters(centers, radii, merging) if clusters is None else clusters
-    inputs = TraversalInputs()
-    inputs.points, inputs.normals = points, normals
-    inputs.spans = receiver_spans(body_spans, points.shape[1], lanes, points.device)
-    inputs.skip_begins, inputs.skip_ends = (
-        span_values([skip[end] for skip in skips], points.device) for end in range(2)
+    nodes, cluster_bounds, run_bounds = find_clusters(centers, radii, merging) if clusters is None else clusters
+    inputs = struct_of(
+        TraversalInputs,
+        points=points,
+        normals=normals,
+        footprints=None,
+        spans=receiver_spans(body_spans, points.shape[1], lanes, points.device),
+        skip_begins=span_values([begin for begin, _ in skips], points.device),
+        skip_ends=span_values([end for _, end in skips], points.device),
+        spheres=struct_of(
+            SphereClusters,
+            **nodes._asdict(),
+            cluster_bounds=cluster_bounds,
+            run_bounds=run_bounds,
+            count=count,
+            merging_angle=merging * cell_radius,
+        ),
     )
-    spheres = inputs.spheres  # filled in place: a struct that is assigned is copied field by field
-    spheres.centers, spheres.radii, spheres.extents = nodes
-    spheres.count, spheres.merging_angle = count, merging * cell_radius
-    spheres.cluster_bounds, spheres.run_bounds = bounds
     return SphereTraversal(inputs, nodes, lanes, points.shape[0] * inputs.spans.block_count)
 
 
