@@ -121,7 +121,11 @@ def test_a_fit_says_before_it_begins_that_its_scale_is_not_told_and_a_reference_
 
 def test_light_that_has_not_converged_is_told():
     problem = Problem(scene(), Target(np.full((16, 16, 3), 5.0)), Light(None, 64))
-    assert "light has not converged" in messages(problem, Stage(40, 1e-2))[0]
+    (told,) = messages(problem, Stage(40, 1e-2))
+    assert "light has not converged" in told and "or a learning_rate of 0.2" in told
+    assert not messages(problem, Stage(200, 0.2))
+    with pytest.raises(ValueError, match="light alone is free"):  # which beside a pose is the other remedy
+        fit(problem, "photograph", progress=False)
     assert not messages(Problem(scene(), Target(ws.render(scene())[..., :3]), Light(2)), Stage(60, 0.05))
 
 

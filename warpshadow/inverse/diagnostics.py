@@ -141,9 +141,11 @@ def warn_of(
     is_falling = end == "finished" and gain > MAX_LAST_GAIN
     if is_falling and problem.light is not None:
         is_doubted = True
+        is_alone = all(free.is_light for free in problem.free)
+        solving = 'stages = "photograph", which solves for the light'
         check.warn(
             f"light has not converged: the loss still fell by {gain:.1%} over the last {_WINDOW // 2} iterations; "
-            'give the last stage more iterations, or stages = "photograph", which solves for the light',
+            f"give the last stage more iterations, or {'a learning_rate of 0.2' if is_alone else solving}",
             DiagnosticWarning,
         )
     if stage.compares == "all" and not is_doubted:
@@ -227,11 +229,11 @@ def _warn_of_exposures(model: Model, images: torch.Tensor) -> bool:
     return bool(gaps)
 
 
-def _warn_of_error(model: Model, images: torch.Tensor, shares: Mapping[int, float], is_falling: bool) -> None:
+def _warn_of_error(model: Model, images: torch.Tensor, explained: Mapping[int, float], is_falling: bool) -> None:
     error, bodies = image_error(model, images), model.context.scene.bodies
-    unexplained = {number: share for number, share in shares.items() if share < MIN_EXPLAINED_SHARE}
+    unexplained = {number: part for number, part in explained.items() if part < MIN_EXPLAINED_SHARE}
     if error > MAX_IMAGE_ERROR or unexplained:
-        shown = ", ".join(f"{share:.0%} of {bodies[number].name!r}" for number, share in unexplained.items())
+        shown = ", ".join(f"{part:.0%} of {bodies[number].name!r}" for number, part in unexplained.items())
         shown = f", and targets show {shown}, shadows included" if shown else ""
         reason = (
             "the loss was still falling: give the last stage more iterations"

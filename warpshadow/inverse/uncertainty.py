@@ -297,9 +297,9 @@ def uncertainty(
     normal = NormalMatrix(problem, context, values)
     inverse = normal.directions @ np.linalg.inv(normal.normal_matrix)
     covariance = inverse @ normal.score_covariance @ inverse.T
-    shares = explained_shares(normal.model, normal.values)
+    explained = explained_shares(normal.model, normal.values)
     poses = {
-        pose.called(fitted): _pose_uncertainty(pose, normal, covariance, shares[pose.number])
+        pose.called(fitted): _pose_uncertainty(pose, normal, covariance, explained[pose.number])
         for pose in problem.free_of(Pose)
     }
     names = [f"{name}.{key}[{number}]" for name, key, number in normal.parameter_entries]
