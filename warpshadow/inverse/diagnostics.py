@@ -88,11 +88,11 @@ def image_error(model: Model, images: torch.Tensor) -> float:
 
 
 def explained_shares(model: Model, values: Mapping[str, Values]) -> dict[int, float]:
-    """Share of what each body of a free pose or shape changes in the images that targets show, by number; 0 to 1.
+    """Shares of the bodies of a free pose or shape that targets show, by number; 0 to 1.
 
-    A body changes the pixels in which it, or its shadow, is seen: from an image without it. A pixel shows that if the
-    target is off the image by less than half of the change; pixels count by their changes, and by their masks. So a few
-    occluders cost little, and a body that covers little of the images counts as much as a large one.
+    A body changes the pixels in which it, or its shadow, is seen: from an image without it. Targets show it in a pixel
+    if they are off the image by less than half of the change; pixels count by their changes, and by their masks. So a
+    few occluders cost little, and a body that covers little of the images counts as much as a large one.
     """
     far = _FAR * float(model.context.distances.max())
     result = {}

@@ -48,7 +48,7 @@ class PoseUncertainty:
         least_turn: Turn beside it [degrees].
         along_view: Part of the shift that is along the view, 0 to 1.
         diagonal: Of the body's bounding box [scene units].
-        explained: Share of what the body and its shadow change in the images that the targets show, 0 to 1; below 0.85
+        explained: Share of the body, by the pixels that it and its shadow change, that targets show, 0 to 1; below 0.85
             it may be elsewhere, whatever the deviations.
         remark: How it stands, if that was assumed: deviations do not know of it.
     """
