@@ -170,6 +170,15 @@ def test_a_size_is_one_number_or_two(cone, tmp_path, size, expected):
     fails("render", cone, "-o", "x.exr", "--size", "8xx", "6", parts=("expected width and height",), status=2)
 
 
+@pytest.mark.parametrize("size", [(8,), (24, 12), (8, 12)])
+def test_a_scene_files_image_may_have_another_size(scene, tmp_path, size):
+    result = run("render", scene, "--size", *size, "--method", "none", "-o", tmp_path / "x.exr")
+    assert result.exit_code == 0, result.output
+    scene.write_text(SCENE.replace("size = [16, 12]", f"size = {[*size, size[-1]][:2]}"))
+    image = ws.render(ws.load_scene(scene, method="none"))
+    np.testing.assert_allclose(ws.read_image(tmp_path / "x.exr"), image, atol=1e-5)
+
+
 def test_a_mesh_gets_its_albedo(cone, tmp_path):
     options = "--albedo", 0.8, 0.4, 0.2, "--size", 16
     result = run("render", cone, "-o", tmp_path / "x.exr", "--up", "z", "--method", "none", *options)

@@ -23,7 +23,8 @@ from warpshadow.inverse import (
     Texture,
     fit,
 )
-from warpshadow.inverse.diagnostics import gain_of_last, warn_before
+from warpshadow.inverse.diagnostics import explained_shares, gain_of_last, warn_before
+from warpshadow.inverse.model import Model
 
 
 def scene(size: float = 4.0) -> ws.Scene:
@@ -120,7 +121,11 @@ def test_a_fit_says_before_it_begins_that_its_scale_is_not_told_and_a_reference_
 
 def test_light_that_has_not_converged_is_told():
     problem = Problem(scene(), Target(np.full((16, 16, 3), 5.0)), Light(None, 64))
-    assert "light has not converged" in messages(problem, Stage(40, 1e-2))[0]
+    (told,) = messages(problem, Stage(40, 1e-2))
+    assert "light has not converged" in told and "or a learning_rate of 0.2" in told
+    assert not messages(problem, Stage(200, 0.2))
+    with pytest.raises(ValueError, match="light alone is free"):  # which beside a pose is the other remedy
+        fit(problem, "photograph", progress=False)
     assert not messages(Problem(scene(), Target(ws.render(scene())[..., :3]), Light(2)), Stage(60, 0.05))
 
 
@@ -150,6 +155,48 @@ def test_images_that_are_explained_poorly_are_told(is_found):
         error = float(re.search(r"images are off by (\d+)% of their root mean square", text)[1]) / 100
         image, target = ws.render(start)[..., :3], ws.render(truth)[..., :3]
         assert error == pytest.approx(np.linalg.norm(image - target) / np.linalg.norm(target), abs=0.05)
+
+
+SMALL = dataclasses.replace(BALL, scale=0.4, translation=(0.9, 0.16, 0), albedo=(0.7, 0.1, 0.1), name="ball")
+
+
+def at(*bodies: ws.Body) -> ws.Scene:
+    camera = scene().camera.resized(2)
+    return dataclasses.replace(scene(), bodies=(*bodies, *scene().bodies), camera=camera, visibility=ws.Visibility())
+
+
+def shares(start: ws.Scene, target: np.ndarray) -> dict[int, float]:
+    problem = Problem(start, Target(target), Pose(0))
+    context = problem.context(torch.device("cpu"))
+    return explained_shares(Model(problem, context, Stage()), problem.start(context))
+
+
+def test_a_body_is_explained_where_targets_show_it_and_its_shadow():
+    target = ws.Renderer(at(SMALL)).render()
+    noise = np.random.default_rng(0).normal(scale=0.02, size=target.shape)
+    assert shares(at(SMALL), target + noise) == pytest.approx({0: 1.0}, abs=0.02)
+    moved = [dataclasses.replace(SMALL, translation=(0.9 - shift, 0.16, 0)) for shift in (0.1, 0.3, 1.5, 90)]
+    one, two, three, four = (shares(at(body), target)[0] for body in moved)
+    assert 0.9 > one > two > three and two < 0.3 and three == four == 0  # the last is out of the frame
+    occluder = target.copy()
+    change = np.linalg.norm(target - ws.Renderer(at()).render(), axis=-1)
+    occluder[np.unravel_index(change.argmax(), change.shape)] = 5.0
+    assert 0.85 < shares(at(SMALL), occluder)[0] < 1.0
+
+
+def test_a_small_body_in_a_wrong_place_is_told_and_its_uncertainty_says_so():
+    """Though it is so small that the whole image is explained."""
+    start, target = at(dataclasses.replace(SMALL, translation=(-0.9, 0.16, 0))), ws.Renderer(at(SMALL)).render()
+    problem = Problem(start, Target(target), Pose("ball"))
+    (told,) = messages(problem, Stage(1, 1e-3))
+    assert "images are off by 1" in told and "and targets show 0% of 'ball', shadows included; a pose may be" in told
+    with pytest.warns(DiagnosticWarning):
+        result = fit(problem, [Stage(1, 1e-3)], progress=False)
+    assert str(result.uncertainty.poses["ball"]).endswith(
+        "but targets show 0% of it and its shadow: it may be elsewhere"
+    )
+    found = fit(dataclasses.replace(problem, scene=at(SMALL)), [Stage(1, 1e-3)], progress=False)
+    assert "elsewhere" not in str(found.uncertainty.poses["ball"])
 
 
 @pytest.mark.parametrize("stops", [-1.65, 0.0])

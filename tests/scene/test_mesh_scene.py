@@ -63,6 +63,12 @@ def test_the_axis_that_points_up_is_guessed_by_the_shape(name):
     assert guess_up(turned, ".glb") == ("y", "as .glb files have it")
 
 
+def test_a_sheet_may_lie_or_stand_so_its_edges_are_no_base():
+    sheet = shapes.sheet("sheet", lambda u, v: (u, 0.12 * np.sin(7 * u) * np.cos(4 * v), v), 20, 20)
+    for mesh in (sheet, sheet.transformed(rotation=TO_Z_UP)):
+        assert guess_up(mesh) == ("y", "its shape does not say")
+
+
 def test_a_guess_is_the_same_for_any_size_and_place():
     mesh = MESHES["chair"]().transformed(rotation=TO_Z_UP)
     for scale in (1e-3, 1e3):

@@ -305,6 +305,22 @@ def test_a_camera_that_frames_takes_no_place(refused, key, parts):
     refused(FRAMED.replace("framing", f"{key}\nframing"), *parts)
 
 
+def test_an_image_of_another_size_is_framed_anew_or_has_the_same_view(load, tmp_path):
+    framed = load(FRAMED)
+    expected = ws.Camera.framing(framed, size=(16, 6))
+    np.testing.assert_array_equal(
+        ws.load_scene(tmp_path / "scene.toml", size=(16, 6)).camera.intrinsics, expected.intrinsics
+    )
+    scene = make_scene(np.ones((4, 3)))
+    off_center = scene.camera.intrinsics + [[0, 0, 1.5], [0, 0, -1], [0, 0, 0]]
+    scene = replace(scene, camera=replace(scene.camera, intrinsics=off_center))
+    ws.write_scene(scene, tmp_path)
+    camera = ws.load_scene(tmp_path / "scene.toml", size=(40, 24)).camera
+    assert (camera.width, camera.height) == (40, 24)
+    expected = [[2 * off_center[0, 0], 0, 20 + 2 * 1.5], [0, 2 * off_center[1, 1], 2 * off_center[1, 2]], [0, 0, 1]]
+    np.testing.assert_allclose(camera.intrinsics, expected)
+
+
 def test_framing_is_auto_or_left_out(refused):
     refused(FRAMED.replace('"auto"', '"fit"'), "[camera]: framing: got 'fit', expected one of 'auto'")
     for key in ("margin = 0.1", "direction = [1, 1, 1]"):

@@ -60,7 +60,7 @@ def _two_numbers(size: tuple[str, str] | None) -> tuple[str, str] | None:
 
 
 class MeshOptions(NamedTuple):
-    """Options of a mesh that is given in place of a scene file."""
+    """Options of a mesh that is given in place of a scene file; of these the size alone is for scene files, too."""
 
     up: Annotated[
         Optional[Literal["y", "z"]],
@@ -68,8 +68,9 @@ class MeshOptions(NamedTuple):
     ] = None
     size: Annotated[
         Optional[tuple[str, str]],
-        _mesh(
-            help="Width and height of the image, in pixels, or one number for both; without it 512 512.",
+        typer.Option(
+            help="Width and height of the image, in pixels, or one number for both; without it those of the scene "
+            "file, of a mesh 512 512.",
             metavar="WIDTH HEIGHT",
             callback=_two_numbers,
         ),
@@ -116,7 +117,6 @@ def with_mesh_options(command: Callable[..., None], *, without: str = "") -> Cal
 
 _KEYS_OF_SCENES = {
     "up": "[[body]] rotation",
-    "size": "[camera] size",
     "albedo": "[[body]] albedo",
     "light": "[light]",
     "direction": '[camera] direction, beside framing = "auto", or eye and target',
@@ -136,22 +136,22 @@ def load(file: Path, options: MeshOptions, is_quiet: bool, **settings: Any) -> S
     if file.suffix.lower() not in (*MESH_SUFFIXES, ".toml") and file.is_file():
         expected = f".toml for a scene file, or a mesh's: {', '.join(MESH_SUFFIXES)}"
         raise ValueError(f"{file}: got extension {file.suffix!r}, expected {expected}")
+    size = None if options.size is None else (int(options.size[0]), int(options.size[1]))
     if file.suffix.lower() not in MESH_SUFFIXES:
-        for name, value in options._asdict().items():
+        for name, value in options._replace(size=None)._asdict().items():
             if value is not None:
                 shown_value = " ".join(map(str, value)) if isinstance(value, tuple) else value
                 option, key = f"--{name.replace('_', '-')}", _KEYS_OF_SCENES[name]
                 raise ValueError(f"{option}: got {shown_value} with {file}, expected a mesh; scene files have {key}")
-        return load_scene(file, **settings)
+        return load_scene(file, size=size, **settings)
     body = Body(file, albedo=options.albedo)
     up: str | None = options.up
     if up is None:
         guess = guess_up(body.mesh, file.suffix.lower())
         up = guess.axis
         note(f"{file}: {up} is taken to be up ({guess.reason}); --up {'zy'['yz'.index(up)]} says otherwise", is_quiet)
-    width, height = map(int, options.size or ("512", "512"))
     direction = options.direction or DIRECTION
-    scene = default_scene(body, up=up, size=(width, height), light=options.light, direction=direction)
+    scene = default_scene(body, up=up, size=size or (512, 512), light=options.light, direction=direction)
     rotated_light = turned_light(scene.light, options.light_rotation or 0.0, 1.0)
     bounces = settings.pop("bounces", scene.bounces)
     return replace(scene, light=rotated_light, visibility=Visibility.of(settings), bounces=bounces)

@@ -119,7 +119,12 @@ class Report:
             return {}
         table: toml_tables.Table = {}
         for name, pose in uncertainty.poses.items():
-            table[name] = {"shift": pose.shift.tolist(), "turn": pose.turn, "least": str(pose)}
+            table[name] = {
+                "shift": pose.shift.tolist(),
+                "turn": pose.turn,
+                "explained": pose.explained,
+                "least": str(pose),
+            }
             if pose.is_flat:
                 check.warn(
                     f"{name} is uncertain by more than {MAX_POSE_UNCERTAINTY:.0%} of its size; {pose}. "

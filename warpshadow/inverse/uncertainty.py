@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from warpshadow.inverse.diagnostics import small_stage
+from warpshadow.inverse.diagnostics import MIN_EXPLAINED_SHARE, explained_shares, small_stage
 from warpshadow.inverse.free import Plane, Pose
 from warpshadow.inverse.free.base import PRIOR, Values
 from warpshadow.inverse.loss import clip_saturated
@@ -48,6 +48,8 @@ class PoseUncertainty:
         least_turn: Turn beside it [degrees].
         along_view: Part of the shift that is along the view, 0 to 1.
         diagonal: Of the body's bounding box [scene units].
+        explained: Share of the body, by the pixels that it and its shadow change, that targets show, 0 to 1; below 0.85
+            it may be elsewhere, whatever the deviations.
         remark: How it stands, if that was assumed: deviations do not know of it.
     """
 
@@ -57,6 +59,7 @@ class PoseUncertainty:
     least_turn: float
     along_view: float
     diagonal: float
+    explained: float = 1.0
     remark: str = ""
 
     @property
@@ -71,7 +74,9 @@ class PoseUncertainty:
             "along the view" if self.along_view > 0.9 else f"along {np.round(self.least / max(length, 1e-12), 2)}"
         )
         text = f"known least: ±{length:.2g} {direction_text}, turned by ±{self.least_turn:.2g}°"
-        return f"{text}; it {self.remark}" if self.remark else text
+        text += f"; it {self.remark}" * bool(self.remark)
+        doubt = f"; but targets show {self.explained:.0%} of it and its shadow: it may be elsewhere"
+        return text + doubt * (self.explained < MIN_EXPLAINED_SHARE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,12 +297,16 @@ def uncertainty(
     normal = NormalMatrix(problem, context, values)
     inverse = normal.directions @ np.linalg.inv(normal.normal_matrix)
     covariance = inverse @ normal.score_covariance @ inverse.T
-    poses = {pose.called(fitted): _pose_uncertainty(pose, normal, covariance) for pose in problem.free_of(Pose)}
+    explained = explained_shares(normal.model, normal.values)
+    poses = {
+        pose.called(fitted): _pose_uncertainty(pose, normal, covariance, explained[pose.number])
+        for pose in problem.free_of(Pose)
+    }
     names = [f"{name}.{key}[{number}]" for name, key, number in normal.parameter_entries]
     return Uncertainty(names, covariance, poses, normal.light)
 
 
-def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) -> PoseUncertainty:
+def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray, explained: float) -> PoseUncertainty:
     """The uncertainty of a pose in scene units and degrees."""
     context = normal.context
     plane = normal.plane(free)
@@ -320,6 +329,7 @@ def _pose_uncertainty(free: Pose, normal: NormalMatrix, covariance: np.ndarray) 
         float(np.degrees(np.linalg.norm(weakest_direction[3:]) / half)),
         view_share,
         2 * half,
+        explained,
         free.constraint(context).remark,
     )
 

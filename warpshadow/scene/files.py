@@ -5,7 +5,7 @@ import functools
 import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from warpshadow import check
 from warpshadow.assets import files
-from warpshadow.assets.camera import Camera
+from warpshadow.assets.camera import Camera, ImageSize
 from warpshadow.assets.camera_conventions import HALF_PIXEL
 from warpshadow.assets.image import write_image
 from warpshadow.assets.known_light import as_light
@@ -58,12 +58,16 @@ class SceneError(ValueError):
     """A scene file that cannot be used: the message names the place and the accepted values."""
 
 
-def load_scene(path: AnyPath, *, bounces: Bounces | None = None, **settings: object) -> Scene:
+def load_scene(
+    path: AnyPath, *, bounces: Bounces | None = None, size: ImageSize | None = None, **settings: object
+) -> Scene:
     """Read a scene file.
 
     Args:
         path: A TOML file; paths in it are relative to it. README.md lists its keys.
         bounces: How often light bounces, in place of the file's.
+        size: Width and height of the image [pixels], or one number for both, in place of the file's. The vertical field
+            of view stays, unless the camera is framed.
         settings: Settings of visibility in place of the file's, such as ``method="log-sh"``. A file may hold settings
             for several methods; settings that the method does not read are left out.
     Raises:
@@ -83,10 +87,10 @@ def load_scene(path: AnyPath, *, bounces: Bounces | None = None, **settings: obj
                 f"got a fit file, expected a scene file, such as the one that it names, {table['scene']}; "
                 f"warpshadow fit {path.name} -o FOLDER runs it, and FOLDER/scene.toml is the result"
             )
-        return _scene(table, path.parent, bounces, settings)
+        return _scene(table, path.parent, bounces, size, settings)
 
 
-def _scene(scene: Table, folder: Path, bounces: Bounces | None, settings: Table) -> Scene:
+def _scene(scene: Table, folder: Path, bounces: Bounces | None, size: ImageSize | None, settings: Table) -> Scene:
     with check.located("the scene"):
         _check_keys("", scene, ("camera", "light", "visibility", "body"), noun="table")
     for name in ("camera", "light", "body"):
@@ -112,7 +116,11 @@ def _scene(scene: Table, folder: Path, bounces: Bounces | None, settings: Table)
         )
         if unframed_key is not None:
             raise ValueError(f'{unframed_key} goes with framing = "auto", in place of eye and target')
-        camera = _framing(camera_table, bodies) if "framing" in camera_table else parse_camera(camera_table)
+        if "framing" in camera_table:
+            camera = _framing(camera_table | ({} if size is None else {"size": size}), bodies)
+        else:
+            camera = parse_camera(camera_table)
+            camera = camera if size is None else _with_size(camera, size)
     with check.located("[visibility]"):
         value = scene.get("visibility", {})
         toml_tables.check_table(value)
@@ -129,6 +137,14 @@ def _framing(table: Table, bodies: Sequence[Body]) -> Camera:
     if placed is not None:
         raise ValueError(f"{placed}: got it beside framing, which finds the place of the camera; expected one of them")
     return toml_tables.make(functools.partial(Camera.framing, bodies), table)
+
+
+def _with_size(camera: Camera, size: ImageSize) -> Camera:
+    """The camera with an image of another size: its field of view stays the same vertically, and pixels as square."""
+    width, height = check.image_size(size)
+    intrinsics = np.diag([height / camera.height, height / camera.height, 1.0]) @ camera.intrinsics
+    intrinsics[0, 2] += (width - camera.width * height / camera.height) / 2
+    return replace(camera, intrinsics=intrinsics, width=width, height=height)
 
 
 def _check_keys(name: str, table: Table, known: Iterable[str] = (), *, noun: str = "key") -> None:

@@ -45,7 +45,7 @@ def guess_up(mesh: Mesh, suffix: str = "") -> UpGuess:
     """Guess whether y or z of a mesh points up.
 
     Things stand on feet or bases that are large beside the parts above, and upside down they are not their own mirror
-    image. A plate may lie and a door may stand, so a thin base does not count. Where nothing decides it is y.
+    image. A plate may lie and a door may stand, so their bases do not count. Where nothing decides it is y.
 
     Args:
         suffix: Of its file, in lower case. glTF and USD have y up as they are read; where nothing decides, STL has z.
@@ -68,8 +68,9 @@ def guess_up(mesh: Mesh, suffix: str = "") -> UpGuess:
     footing = {axis: _standing_share(points, samples[0].mean(axis=0), number) for axis, number in _AXES.items()}
     axis, other = sorted(footing, key=lambda item: -footing[item])
     extents = np.ptp(points, axis=0)
-    is_thin = extents[_AXES[axis]] < _PLATE_THINNESS * np.delete(extents, _AXES[axis]).min()
-    if footing[axis] < footing[other] + _MIN_FOOTING_DIFFERENCE or is_thin:
+    thickness, breadth, _ = np.sort(extents)
+    is_plate = extents.argmin() in _AXES.values() and thickness < _PLATE_THINNESS * breadth
+    if footing[axis] < footing[other] + _MIN_FOOTING_DIFFERENCE or is_plate:
         is_z = suffix in _Z_UP_FORMATS
         return UpGuess("z" if is_z else "y", f"as {suffix} files often have it" if is_z else "its shape does not say")
     return UpGuess(axis, f"it stands firmer than on {other}")

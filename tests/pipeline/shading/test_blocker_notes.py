@@ -2,6 +2,7 @@
 
 import warpshadow as ws
 from demos import shapes
+from warpshadow.pipeline.shading import scene_blockers
 
 
 def notes(bodies, **options):
@@ -34,9 +35,15 @@ def test_each_body_has_a_line_with_its_kind_and_reason():
     assert 'spheres: self_shadows = "spheres" asks for them, and its own by spheres: self_shadows' in free
 
 
-def test_cloth_blocks_as_panels():
+def test_cloth_blocks_as_panels_and_many_of_them_name_the_setting_that_is_faster(monkeypatch):
     tent, _ = notes([ws.Body(shapes.tent()), GROUND], method="directional")
-    assert "convex parts: it is made of few panels, and its own by rays, traced once" in tent
+    assert tent.endswith("convex parts: it is made of few panels, and its own by rays, traced once.")
+    edge_count = sum(len(part.edges) for part in shapes.tent().convex_parts)
+    for limit in (edge_count, edge_count - 1):
+        monkeypatch.setattr(scene_blockers, "_MANY_EDGES", limit)
+        tent, box, _ = notes([ws.Body(shapes.tent()), BOX, GROUND], method="directional")
+        assert ("traced once; spheres, blockers = 256, take half of the time" in tent) == (limit < edge_count)
+        assert "blockers = 256" not in box
 
 
 def test_a_box_that_is_to_trace_its_own_shadow_blocks_as_a_part_of_which_it_is_made():
