@@ -33,7 +33,7 @@ METHODS = {
 
 def main(data: Path | None, sphere_count: int, samples: int) -> None:
     ws.quiet()
-    warnings.filterwarnings("ignore", module="warpshadow")  # meshes with unreferenced vertices
+    warnings.simplefilter("ignore")  # meshes with unreferenced vertices
     meshes, skies = load_meshes(data), load_skies(data)
     pairs = [(meshes[i % len(meshes)], skies[i % len(skies)]) for i in range(max(len(meshes), len(skies)))]
     print(f"{'mesh':18}{'sky':16}" + "".join(f"{label:>17}" for label in METHODS))

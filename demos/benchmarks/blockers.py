@@ -29,7 +29,7 @@ SHAPES = (shapes.chair, shapes.wheel, shapes.fence, shapes.cage, shapes.bowl, sh
 def main(data: Path | None, names: list[str], counts: list[int], size: int, samples: int, runs: int) -> None:
     ws.quiet(progress=False)
     ws.set_thread_count(1)
-    warnings.filterwarnings("ignore", module="warpshadow")  # meshes with unreferenced vertices, ragged shadows
+    warnings.simplefilter("ignore")  # meshes with unreferenced vertices, ragged shadows
     print("| body | the default blocks as | default |" + "".join(f" {count} spheres |" for count in counts))
     print("| --- " * (3 + len(counts)) + "|")
     for mesh in [*load_meshes(data), *(make() for make in SHAPES)]:

@@ -118,7 +118,7 @@ def main(
     names: Sequence[str] = (*THREE, *KINDS),
 ) -> None:
     ws.quiet()
-    warnings.filterwarnings("ignore", module="warpshadow")  # many spheres in spherical harmonics; coarse faces
+    warnings.simplefilter("ignore")  # many spheres in spherical harmonics; coarse faces
     scenes = quick_scenes() if quick else load_scenes(data, names)
     true_count = 1024 if quick else TRUE_COUNT
     output.mkdir(exist_ok=True)

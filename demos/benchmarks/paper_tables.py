@@ -222,7 +222,7 @@ def ablate(data: Path | None, output: Path, count: int, iterations: int | None) 
 def prepare(output: Path) -> None:
     ws.quiet()
     torch.set_num_threads(1)
-    warnings.filterwarnings("ignore", module="warpshadow")  # meshes with unreferenced vertices
+    warnings.simplefilter("ignore")  # meshes with unreferenced vertices
     output.mkdir(parents=True, exist_ok=True)
 
 
