@@ -30,8 +30,8 @@ MIN_BOUNDS = wp.constant(1.0e-6)
 """Σ ν ν below which blockers count as independent: such a product is of the size of its rounding."""
 
 MOMENT_BOUND = wp.constant(wp.vec3(0.96935, -0.81588, 1.36307))
-"""ν(h) by powers of h (1 − h), from the first on, fitted to within 0.0005: a half-plane at d from the middle of a disc of
-radius 1 covers h = (acos d − d √(1 − d²)) / π, with the moment 2 (1 − d²)^(3/2) / 3π."""
+"""ν(h) by powers of h (1 − h), from the first on, fitted to within 0.0005: a half-plane at the distance d from the
+middle of a disc of radius 1 covers h = (acos d − d √(1 − d²)) / π, with the moment 2 (1 − d²)^(3/2) / 3π."""
 
 _PASS_COST = 1.0  # time of a cell [ns]
 

@@ -322,7 +322,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
 
     @wp.func(inline=True)
     def visit(receivers: ReceiverLanes, sphere_view: SphereView, count: int, task: LightTask):
-        """Add to the gradients of a proxy by its cone, and by its weight w, of which w̄ w = Σ ā a."""
+        """Add to the gradients of a proxy by its cone and its weight w: w̄ w = Σ ā a."""
         adj_sphere, relative_adjoint = cap_adjoint(receivers, sphere_view, count, task)
         if adj_sphere.is_any:
             adj_offset, adj_radius = weight_adjoint(

@@ -106,7 +106,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
 
     @wp.func
     def bound_by_hull(inputs: PartInputs, hull: int, task: PartsTask, covered_count: int):
-        """Replace the coverage by a compound's parts by that of its hull in cells of which the hull covers less."""
+        """Replace the coverage by the parts of a compound in cells that its hull covers less; mark these cells."""
         bound = find_bound(inputs, hull, task)
         silhouette = task.silhouette
         count, is_solid = find_silhouette(inputs.parts, hull, silhouette)

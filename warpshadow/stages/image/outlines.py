@@ -24,19 +24,35 @@ MIN_DISTANCE = 0.02  # distance of an edge [samples] below which rounding outwei
 REACH = 2  # steps from outlines up to which samples have mean slopes: farther in these would lose detail of textures
 
 
+@wp.struct
+class SurfaceArrays:
+    """Fragments, and the edges beside them: of flat images, as kernels take them."""
+
+    fragments: FragmentArrays
+    entries: wp.array(dtype=wp.int32)  # [sample], −1 for none
+    edges: wp.array2d(dtype=wp.vec2i)  # [entry, direction]
+
+
+def make_surface_arrays(silhouettes: Silhouettes, clip_positions: wp.array) -> SurfaceArrays:
+    """Fragments of silhouettes, and the edges beside them."""
+    surfaces = SurfaceArrays()
+    surfaces.fragments = make_fragment_arrays(silhouettes.fragments, silhouettes.faces, clip_positions)
+    surfaces.entries, surfaces.edges = silhouettes.entries, silhouettes.edges
+    return surfaces
+
+
 @wp.func
-def distance_to_end(
-    fragments: FragmentArrays, entries: wp.array(dtype=wp.int32), edges: wp.array2d(dtype=wp.vec2i), sample: int, k: int
-):
+def distance_to_end(surfaces: SurfaceArrays, sample: int, k: int):
     """Distance at which a sample's surface ends before its neighbor in direction k [samples].
 
     −1 if no edge is known between them; −2 if the neighbor sees another surface or nothing, or is outside.
     """
+    fragments = surfaces.fragments
     if not has_neighbor(sample, k, fragments.width, fragments.height):
         return -2.0
-    entry = entries[sample]
+    entry = surfaces.entries[sample]
     if entry >= 0:
-        edge = edges[entry, k]
+        edge = surfaces.edges[entry, k]
         if edge[0] != NOTHING:
             if edge[0] >= 0:
                 line = line_between(fragments, sample, k, edge)
@@ -49,9 +65,7 @@ def distance_to_end(
 
 @wp.func
 def _mark_mean_slope(
-    fragments: FragmentArrays,
-    entries: wp.array(dtype=wp.int32),
-    edges: wp.array2d(dtype=wp.vec2i),
+    surfaces: SurfaceArrays,
     sides: wp.array(dtype=wp.int32),
     keys: wp.array(dtype=wp.int32),
     has_mean_slope: wp.array(dtype=wp.bool),
@@ -63,8 +77,8 @@ def _mark_mean_slope(
         if keys:
             is_known = keys[sides[sample]] < 0
         for axis in range(2):
-            forward = distance_to_end(fragments, entries, edges, sample, 2 * axis)
-            backward = distance_to_end(fragments, entries, edges, sample, 2 * axis + 1)
+            forward = distance_to_end(surfaces, sample, 2 * axis)
+            backward = distance_to_end(surfaces, sample, 2 * axis + 1)
             is_known = is_known and wp.max(forward, backward) > -2.0
         if is_known:
             has_mean_slope[sample] = True
@@ -74,9 +88,7 @@ def _mark_mean_slope(
 def _find_outline_samples(
     # in
     samples: wp.array(dtype=wp.int32),
-    fragments: FragmentArrays,
-    entries: wp.array(dtype=wp.int32),
-    edges: wp.array2d(dtype=wp.vec2i),
+    surfaces: SurfaceArrays,
     sides: wp.array(dtype=wp.int32),
     keys: wp.array(dtype=wp.int32),
     reach: int,
@@ -91,24 +103,24 @@ def _find_outline_samples(
     is_at_outline = bool(False)
     if sample >= 0:
         for k in range(4):
-            is_at_outline = is_at_outline or distance_to_end(fragments, entries, edges, sample, k) > 0.0
+            is_at_outline = is_at_outline or distance_to_end(surfaces, sample, k) > 0.0
     if is_at_outline:
-        _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, sample)
+        _mark_mean_slope(surfaces, sides, keys, has_mean_slope, sample)
         for k in range(4):
             on_path = sample
             steps = int(0)
-            while steps < reach and distance_to_end(fragments, entries, edges, on_path, k) == -1.0:
-                on_path = neighbor(on_path, k, fragments.width)
+            while steps < reach and distance_to_end(surfaces, on_path, k) == -1.0:
+                on_path = neighbor(on_path, k, surfaces.fragments.width)
                 steps += 1
-                _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, on_path)
+                _mark_mean_slope(surfaces, sides, keys, has_mean_slope, on_path)
                 for turn in range(2):
                     direction = wp.where(k < 2, 2, 0) + turn
                     end = on_path
                     further_steps = steps
-                    while further_steps < reach and distance_to_end(fragments, entries, edges, end, direction) == -1.0:
-                        end = neighbor(end, direction, fragments.width)
+                    while further_steps < reach and distance_to_end(surfaces, end, direction) == -1.0:
+                        end = neighbor(end, direction, surfaces.fragments.width)
                         further_steps += 1
-                        _mark_mean_slope(fragments, entries, edges, sides, keys, has_mean_slope, end)
+                        _mark_mean_slope(surfaces, sides, keys, has_mean_slope, end)
 
 
 def find_outline_samples(
@@ -125,12 +137,11 @@ def find_outline_samples(
 
     Not differentiable.
     """
-    fragments = silhouettes.fragments
+    fragments, surfaces = silhouettes.fragments, make_surface_arrays(silhouettes, clip_positions)
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
     has_mean_slope = zeros(rows(sides).shape, dtype=wp.bool, device=sides.device)
-    arrays = make_fragment_arrays(fragments, silhouettes.faces, clip_positions)
     keys = None if quadtree is None else quadtree.square_key_of_side
-    inputs = [silhouettes.samples, arrays, silhouettes.entries, silhouettes.edges, reshaped(sides, (-1,)), keys, REACH]
+    inputs = [silhouettes.samples, surfaces, reshaped(sides, (-1,)), keys, REACH]
     launch(_find_outline_samples, silhouettes.samples.size, inputs=inputs, outputs=[reshaped(has_mean_slope, (-1,))])
     return has_mean_slope
 

@@ -45,7 +45,7 @@ from warpshadow.device.launch import launch, without_gradient
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import record_adjoint
 from warpshadow.stages.image.film import sample_radiance
-from warpshadow.stages.image.outlines import distance_to_end
+from warpshadow.stages.image.outlines import SurfaceArrays, distance_to_end, make_surface_arrays
 from warpshadow.stages.raster.interpolation import interpolate, interpolate_values_adjoint, interpolate_weights_adjoint
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.screen import (
@@ -60,7 +60,7 @@ from warpshadow.stages.raster.screen import (
 from warpshadow.stages.silhouettes.areas import LineArea
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
 from warpshadow.stages.silhouettes.find import Silhouettes
-from warpshadow.stages.silhouettes.lines import FragmentArrays, edge_position_adjoint, make_fragment_arrays
+from warpshadow.stages.silhouettes.lines import FragmentArrays, edge_position_adjoint
 from warpshadow.stages.silhouettes.smooth import find_image_weight
 
 MIN_WEIGHT = 0.25  # of a sample in the smoothed image, by which its slopes are divided
@@ -140,24 +140,17 @@ def _inner_step(image: _ImageArrays, sample: int, other: int, adj_color: wp.vec3
 
 @wp.func
 def _measure_steps(
-    image: _ImageArrays,
-    fragments: FragmentArrays,
-    entries: wp.array(dtype=wp.int32),
-    edges: wp.array2d(dtype=wp.vec2i),
-    sample: int,
-    fragment: int,
-    adj_color: wp.vec3,
-    moving: _MovingFactors,
+    image: _ImageArrays, surfaces: SurfaceArrays, sample: int, fragment: int, adj_color: wp.vec3, moving: _MovingFactors
 ):
     """Steps of a sample to its neighbors, or to the edges before these."""
     steps = _ColorSteps(wp.vec2(), wp.vec4(), wp.vec2(), wp.vec2(1.0, 1.0))  # type: ignore[call-arg]
     for direction in range(4):
         axis = direction / 2
         sign = direction_sign(direction)
-        distance = distance_to_end(fragments, entries, edges, fragment, direction)
-        other = neighbor(sample, direction, fragments.width)
+        distance = distance_to_end(surfaces, fragment, direction)
+        other = neighbor(sample, direction, surfaces.fragments.width)
         if distance > 0.0:
-            step = image.edge_colors[entries[fragment], direction] - image.colors[sample]
+            step = image.edge_colors[surfaces.entries[fragment], direction] - image.colors[sample]
             adj_step = wp.dot(adj_color, wp.vec3(step[0], step[1], step[2]))
             steps.to_edges[direction] = wp.where(moving.light, sign * adj_step, 0.0)
             steps.lengths[axis] += distance
@@ -201,9 +194,7 @@ def _add_shading_gradients(
     receiver_faces: wp.array(dtype=wp.vec3i),
     shading: wp.array2d(dtype=wp.vec3),
     albedo: wp.array2d(dtype=wp.vec3),
-    fragments: FragmentArrays,
-    entries: wp.array(dtype=wp.int32),
-    edges: wp.array2d(dtype=wp.vec2i),
+    surfaces: SurfaceArrays,
     line_areas: wp.array2d(dtype=LineArea),
     edge_colors: wp.array3d(dtype=wp.vec4),
     has_mean_slope: wp.array2d(dtype=wp.bool),
@@ -216,6 +207,7 @@ def _add_shading_gradients(
 ):
     """A thread owns a run of samples of all instances; ``fragment`` is the index of a sample in flat images."""
     first_sample = (first_row + wp.tid()) * run
+    fragments = surfaces.fragments
     samples_per_unit = half_size(fragments.width, fragments.height)
     for batch in range(adj_samples.shape[0]):
         view_batch = instance_in(batch, receiver_face_ids.shape[0])
@@ -242,16 +234,16 @@ def _add_shading_gradients(
             is_moving = fragments.face_ids[fragment] >= 0 and (moving.light or moving.albedo)
             if is_moving and wp.length_sq(adj_color) > 0.0:
                 center = sample_center(fragment, fragments.width, fragments.height)
-                entry = entries[fragment]
+                entry = surfaces.entries[fragment]
                 image_weight = float(1.0)
                 if entry >= 0:
-                    image_weight = find_image_weight(fragment, entry, entries, line_areas, fragments.width)
+                    image_weight = find_image_weight(fragment, entry, surfaces.entries, line_areas, fragments.width)
                     image_weight = wp.max(image_weight, MIN_WEIGHT)
                 steps = _ColorSteps(wp.vec2(), wp.vec4(), wp.vec2(), wp.vec2(1.0, 1.0))  # type: ignore[call-arg]
                 if entry >= 0 or is_receiver or moving.albedo or not _is_surrounded(fragments, fragment):
-                    steps = _measure_steps(image, fragments, entries, edges, sample, fragment, adj_color, moving)
+                    steps = _measure_steps(image, surfaces, sample, fragment, adj_color, moving)
                 if wp.length_sq(steps.to_edges) > 0.0:
-                    _follow_edges(steps, image_weight, edges[entry], center, samples_per_unit, clip, adj_clip)
+                    _follow_edges(steps, image_weight, surfaces.edges[entry], center, samples_per_unit, clip, adj_clip)
                 slope = wp.cw_mul(wp.cw_div(steps.inner, steps.lengths), samples_per_unit)
                 corners = fragments.faces[fragments.face_ids[fragment]]
                 if wp.min(steps.lengths) == 0.0:
@@ -320,9 +312,7 @@ def moving_radiance(
                 faces,
                 shading,
                 rows(albedo),
-                make_fragment_arrays(silhouettes.fragments, silhouettes.faces, clip_positions),
-                silhouettes.entries,
-                silhouettes.edges,
+                make_surface_arrays(silhouettes, clip_positions),
                 silhouettes.line_areas,
                 edge_colors,
                 has_mean_slope,

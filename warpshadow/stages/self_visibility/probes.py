@@ -178,7 +178,7 @@ def _cut_faces(
 
 @wp.struct
 class ProbeTable:
-    """Pieces of a body, and the numbers of its vertices, faces and probes, by which its receivers find probes."""
+    """By which receivers of a body find their probes."""
 
     first_vertex: int  # of the body's vertices among all
     first_face: int  # likewise of its faces
@@ -272,7 +272,7 @@ def _find_sample_weights(
 
 
 class ProbeTables(NamedTuple):
-    """A :class:`ProbeTable` for each of some bodies."""
+    """By which receivers of some bodies find their probes."""
 
     tables: tuple[ProbeTable, ...]  # of each body
     table: wp.array  # the same on the device
@@ -301,10 +301,9 @@ class ProbeTables(NamedTuple):
     def of_vertices(
         self, vertices: wp.array, spans: Sequence[Span] = (), table_of_span: Sequence[int] = (0,)
     ) -> ProbeWeights:
-        """Find the probe weights of receivers at vertices, with a batch of 1.
+        """Weights of vertices and their backs, int32 of shape [receiver], indices among all vertices: batch 1.
 
         Args:
-            vertices: Indices among all vertices, backs after them, int32 of shape [receiver].
             spans: Of the receivers, by body; () for one of all.
             table_of_span: The number of each span's body among those of the tables.
         """
