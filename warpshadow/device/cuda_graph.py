@@ -36,7 +36,7 @@ def is_readable(device: wp.Device) -> bool:
 
 
 def is_captured(device: wp.Device) -> bool:
-    """Whether calls are captured on a device. On a CPU they are not: its graphs save nothing and run on one thread."""
+    """Whether calls are captured on a device. On a CPU they are not: its graphs run on one thread, and save little."""
     return device.is_cuda
 
 

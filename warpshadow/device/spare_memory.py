@@ -5,6 +5,7 @@ and every page of a new one stops the kernel that first writes to it: a fifth of
 keeps itself, but a call of it takes ten times as long as that of a list.
 """
 
+import contextlib
 import functools
 import threading
 from collections.abc import Callable
@@ -49,7 +50,7 @@ class SpareMemory:
                     self.cached_bytes -= size
                     return self._blocks[size].pop()
         block = self._take(size)
-        if not block and self.cached_bytes:
+        if not block:
             self.clear()
             block = self._take(size)
         return block
@@ -73,8 +74,9 @@ class SpareMemory:
         """Give all that is kept back to the system."""
         with self._lock:
             for blocks in self._blocks.values():
-                while blocks:
-                    self._give_back(blocks.pop())
+                with contextlib.suppress(IndexError):  # other threads take small ones meanwhile
+                    while True:
+                        self._give_back(blocks.pop())
             self.cached_bytes = 0
 
 
