@@ -13,8 +13,8 @@ from warpshadow.stages.self_visibility.trace import ray_count, trace_seconds
 
 _BUNNY_FACES = 12_200
 _STILL_PIXEL_SECONDS = 2.0e-5
-"""Time of a pixel of a still on one thread [s]: 15 stills of that bunny on a ground, 256 × 256, took 1.15 to 1.5 s of CPU
-time each (an AMD EPYC, Zen 4, busy). It grows with faces as that of other rays."""
+"""Time of a pixel of a still on one thread [s]: 15 stills of that bunny on a ground, 256 × 256, took 1.15 to 1.5 s of
+CPU time each (an AMD EPYC, Zen 4, busy). It grows with faces as that of other rays."""
 
 
 def setup_seconds(scene: Scene, *, device: wp.DeviceLike = "cpu") -> float:
