@@ -92,9 +92,10 @@ def explained_shares(model: Model, values: Mapping[str, Values]) -> dict[int, fl
     """Shares of the bodies of a free pose or shape that targets show, by number; 0 to 1.
 
     A body changes the pixels in which it, or its shadow, is seen: from an image without it. Targets show it in a pixel
-    if they are off the image by less than half of the change, or less than twice as much as elsewhere; pixels count by
-    their changes, and by their masks. So a few occluders cost little, and a body that covers little of the images
-    counts as much as a large one. Of a body with outlines it is the share that its mask and an outline have in common.
+    if they are off the image by less than half of the change, or less than three times as much as elsewhere, by the
+    median; pixels count by their changes, and by their masks. So a few occluders cost little, and a body that covers
+    little of the images counts as much as a large one. Of a body with outlines it is the share that its mask and an
+    outline have in common.
     """
     far = _FAR * float(model.context.distances.max())
     result: dict[int, float] = {}
@@ -113,7 +114,7 @@ def explained_shares(model: Model, values: Mapping[str, Values]) -> dict[int, fl
             changes = (_in_units(model, world.images()) - images).norm(dim=-1) * (model.weights > 0)
             is_changed = changes > max(_SEEN_CHANGE * float(changes.max()), _LEAST_CHANGE)
             elsewhere = residuals[~is_changed & (model.weights > 0)]
-            accepted = (changes / 2).clamp_min(2 * float(elsewhere.median()) if len(elsewhere) else 0.0)
+            accepted = (changes / 2).clamp_min(3 * float(elsewhere.median()) if len(elsewhere) else 0.0)
             counts = model.weights * changes * is_changed
             result[number] = float((counts * (residuals < accepted)).sum() / counts.sum().clamp_min(1e-30))
     return result
