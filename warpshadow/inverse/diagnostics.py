@@ -250,10 +250,10 @@ def _warn_of_exposures(model: Model, images: torch.Tensor) -> bool:
 
 
 def _warn_of_error(model: Model, images: torch.Tensor, explained: Mapping[int, float], is_falling: bool) -> None:
-    error, bodies = image_error(model, images), model.context.scene.bodies
+    error, names = image_error(model, images), model.context.scene.unique_names
     unexplained = {number: part for number, part in explained.items() if part < MIN_EXPLAINED_SHARE}
     if error > MAX_IMAGE_ERROR or unexplained:
-        shown = ", ".join(f"{part:.0%} of {bodies[number].name!r}" for number, part in unexplained.items())
+        shown = ", ".join(f"{part:.0%} of {names[number]!r}" for number, part in unexplained.items())
         shown = f", and targets show {shown}, shadows included" if shown else ""
         reason = (
             "the loss was still falling: give the last stage more iterations"
