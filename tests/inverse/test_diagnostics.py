@@ -165,8 +165,8 @@ def at(*bodies: ws.Body) -> ws.Scene:
     return dataclasses.replace(scene(), bodies=(*bodies, *scene().bodies), camera=camera, visibility=ws.Visibility())
 
 
-def shares(start: ws.Scene, target: np.ndarray) -> dict[int, float]:
-    problem = Problem(start, Target(target), Pose(0))
+def shares(start: ws.Scene, target: np.ndarray, **options) -> dict[int, float]:
+    problem = Problem(start, Target(target, **options), Pose(0))
     context = problem.context(torch.device("cpu"))
     return explained_shares(Model(problem, context, Stage()), problem.start(context))
 
@@ -182,6 +182,19 @@ def test_a_body_is_explained_where_targets_show_it_and_its_shadow():
     change = np.linalg.norm(target - ws.Renderer(at()).render(), axis=-1)
     occluder[np.unravel_index(change.argmax(), change.shape)] = 5.0
     assert 0.85 < shares(at(SMALL), occluder)[0] < 1.0
+
+
+def test_a_body_with_outlines_is_explained_by_them_alone():
+    outlines = {0: np.reshape(ws.Renderer(at(SMALL)).layers().masks, (-1, 32, 32))[0]}
+    moved = [dataclasses.replace(SMALL, translation=(0.9 - shift, 0.16, 0)) for shift in (0.0, 0.1, 1.5)]
+    one, two, three = (shares(at(body), np.ones((32, 32, 3)), outlines=outlines)[0] for body in moved)
+    assert one > 0.9 and 0.3 < two < 0.8 and three == pytest.approx(0, abs=0.02)
+
+
+def test_residuals_that_are_as_large_elsewhere_tell_nothing_of_a_body():
+    target = ws.Renderer(at(SMALL)).render()
+    pattern = np.where(np.indices((32, 32)).sum(axis=0) % 2, 1.0, -1.0)[..., None] * [0.3, 0.3, 0.3, 0]
+    assert shares(at(SMALL), target + pattern) == pytest.approx({0: 1.0}, abs=0.05)
 
 
 def test_a_small_body_in_a_wrong_place_is_told_and_its_uncertainty_says_so():

@@ -131,6 +131,9 @@ def test_a_translation_is_printed_with_the_shift_of_the_middle_from_the_start():
     moved = [float(part) for part in shift.split(", ")]
     np.testing.assert_allclose(moved, body.to_world(np.array([50.0, 0, 0])) - (0, 0.6, 0), atol=1e-4)
     assert 0 < np.linalg.norm(moved) < 1
+    twin = replace(ball, translation=(-48, 0.6, 0))
+    twins = run(Pose(0), scene=replace(scene, bodies=[ball, twin, scene.bodies[1]]))
+    assert [line.split()[0] for line in found_values(twins) if "translation" in line] == ["body_0"]
 
 
 def test_found_values_stand_below_each_other_with_their_units():

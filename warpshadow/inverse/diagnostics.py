@@ -15,7 +15,8 @@ from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
-from warpshadow.inverse.world import FitContext
+from warpshadow.inverse.target import Outlines
+from warpshadow.inverse.world import FitContext, World
 from warpshadow.scene.remarks import is_out_of_frame
 
 MAX_UNSEEN_SHARE = 0.01  # share of the counted pixels that may see no body without a warning
@@ -36,8 +37,8 @@ off by 14% alone.
 """
 
 _FAR = 1e3  # distance at which a body is taken away [distances of the scene from the eye]
-_SEEN_EFFECT = 0.1  # part of a body's largest effect on a pixel from which on that pixel counts
-_LEAST_EFFECT = 1e-3  # the largest effect of a body that is not seen, nor its shadow [radiance units of the fit]
+_SEEN_CHANGE = 0.1  # part of the largest change of a pixel by a body from which on pixels count
+_LEAST_CHANGE = 1e-3  # largest change by a body that is not seen, nor its shadow [root mean squares of the targets]
 
 _WINDOW = 20  # iterations, of which the second half is compared with the first
 _SIDE = 96  # shorter side of small images [pixels]
@@ -91,22 +92,41 @@ def explained_shares(model: Model, values: Mapping[str, Values]) -> dict[int, fl
     """Shares of the bodies of a free pose or shape that targets show, by number; 0 to 1.
 
     A body changes the pixels in which it, or its shadow, is seen: from an image without it. Targets show it in a pixel
-    if they are off the image by less than half of the change; pixels count by their changes, and by their masks. So a
-    few occluders cost little, and a body that covers little of the images counts as much as a large one.
+    if they are off the image by less than half of the change, or less than three times as much as elsewhere, by the
+    median; pixels count by their changes, and by their masks. So a few occluders cost little, and a body that covers
+    little of the images counts as much as a large one. Of a body with outlines it is the share that its mask and an
+    outline have in common.
     """
     far = _FAR * float(model.context.distances.max())
-    result = {}
+    result: dict[int, float] = {}
     with torch.no_grad():
-        images = _in_units(model, model.images(values))
+        world = model.world(values)
+        images = _in_units(model, world.images())
         residuals = (_in_units(model, model.targets) - images).norm(dim=-1)
+        outlined_shares = {} if model.outlines is None else _outlined_shares(model.outlines, world)
         for number in sorted({free.number for free in model.problem.free_of_bodies if free.reframes}):
+            if number in outlined_shares:
+                result[number] = outlined_shares[number]
+                continue
             world = model.world(values)
             world.translations[number] = world.translations[number] - far * torch.eye(3, device=residuals.device)[1]
             world.moving.add(number)
-            effects = model.weights * (_in_units(model, world.images()) - images).norm(dim=-1)
-            effects = effects * (effects > max(_SEEN_EFFECT * float(effects.max()), _LEAST_EFFECT))
-            is_shown = model.weights * residuals < effects / 2
-            result[number] = float((effects * is_shown).sum() / effects.sum().clamp_min(1e-30))
+            changes = (_in_units(model, world.images()) - images).norm(dim=-1) * (model.weights > 0)
+            is_changed = changes > max(_SEEN_CHANGE * float(changes.max()), _LEAST_CHANGE)
+            elsewhere = residuals[~is_changed & (model.weights > 0)]
+            accepted = (changes / 2).clamp_min(3 * float(elsewhere.median()) if len(elsewhere) else 0.0)
+            counts = model.weights * changes * is_changed
+            result[number] = float((counts * (residuals < accepted)).sum() / counts.sum().clamp_min(1e-30))
+    return result
+
+
+def _outlined_shares(outlines: Outlines, world: World) -> dict[int, float]:
+    """Least share of each body's mask and outline that both have, by number."""
+    masks, result = world.masks(), dict[int, float]()
+    gaps = outlines.differences(masks, world.outline_offsets)
+    for view, body, gap in zip(outlines.views, outlines.bodies, gaps, strict=True):
+        union = torch.maximum(masks[view, body], masks[view, body] - gap).sum().clamp_min(1e-30)
+        result[body] = min(result.get(body, 1.0), 1 - float(gap.abs().sum() / union))
     return result
 
 
@@ -230,10 +250,10 @@ def _warn_of_exposures(model: Model, images: torch.Tensor) -> bool:
 
 
 def _warn_of_error(model: Model, images: torch.Tensor, explained: Mapping[int, float], is_falling: bool) -> None:
-    error, bodies = image_error(model, images), model.context.scene.bodies
+    error, names = image_error(model, images), model.context.scene.unique_names
     unexplained = {number: part for number, part in explained.items() if part < MIN_EXPLAINED_SHARE}
     if error > MAX_IMAGE_ERROR or unexplained:
-        shown = ", ".join(f"{part:.0%} of {bodies[number].name!r}" for number, part in unexplained.items())
+        shown = ", ".join(f"{part:.0%} of {names[number]!r}" for number, part in unexplained.items())
         shown = f", and targets show {shown}, shadows included" if shown else ""
         reason = (
             "the loss was still falling: give the last stage more iterations"

@@ -172,7 +172,8 @@ def _describe_shift(before: Body, after: Body) -> str:
 def found_values(result: Result) -> list[str]:
     """Describe the changes of a fit, a line each, their values below each other: poses, materials, exposures, light."""
     rows, start, scene = list[tuple[str, str]](), result.problem.scene, result.scene
-    for before, after in zip(start.bodies, scene.bodies, strict=True):
+    names = scene.unique_names
+    for body_name, before, after in zip(names, start.bodies, scene.bodies, strict=True):
         for name in ("translation", "rotation", "scale", "albedo", *GLOSS_ARGUMENTS, "emission"):
             values = np.asarray(getattr(after, name))
             if (
@@ -181,7 +182,7 @@ def found_values(result: Result) -> list[str]:
                 and values.size <= 3
             ):
                 remark = {"rotation": "°", "translation": _describe_shift(before, after)}.get(name, "")
-                rows.append((f"{after.name} {name}", f"({format_numbers(values)}){remark}"))
+                rows.append((f"{body_name} {name}", f"({format_numbers(values)}){remark}"))
     if scene.light is not start.light:
         radiance = scene.known_light.radiance
         directions = sh.equirectangular_directions(len(radiance)).astype(np.float32)

@@ -353,6 +353,12 @@ class Scene:
         return tuple(self.body_number(body, argument) for body in bodies)
 
     @property
+    def unique_names(self) -> list[str]:
+        """Names of the bodies; body_0 and so on, by number, where several have one."""
+        names = [body.name for body in self.bodies]
+        return [name if names.count(name) == 1 else f"body_{number}" for number, name in enumerate(names)]
+
+    @property
     def catchers(self) -> tuple[int, ...]:
         """Numbers of the bodies that model surfaces of the photograph."""
         return tuple(number for number, body in enumerate(self.bodies) if body.shadow_catcher)

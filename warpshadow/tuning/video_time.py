@@ -12,9 +12,9 @@ from warpshadow.spheres.fit import fit_seconds, is_fitted
 from warpshadow.stages.self_visibility.trace import ray_count, trace_seconds
 
 _BUNNY_FACES = 12_200
-_STILL_PIXEL_SECONDS = 2.8e-5
-"""Time of a pixel of a still on one thread [s]: 48 stills of that bunny on a ground, 256 × 256, took 88 s of CPU time
-(two cores of an AMD EPYC, Zen 5). It grows with faces as that of other rays."""
+_STILL_PIXEL_SECONDS = 2.0e-5
+"""Time of a pixel of a still on one thread [s]: 15 stills of that bunny on a ground, 256 × 256, took 1.15 to 1.5 s of
+CPU time each (an AMD EPYC, Zen 4, busy). It grows with faces as that of other rays."""
 
 
 def setup_seconds(scene: Scene, *, device: wp.DeviceLike = "cpu") -> float:

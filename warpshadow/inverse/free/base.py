@@ -175,9 +175,7 @@ class FreeOfBody(Free):
 
     def called(self, fitted: FittedScene) -> str:
         """The name of its body, or its number if the name is not unique."""
-        names = [body.name for body in fitted.scene.bodies]
-        body_name = names[self.number]
-        return body_name if names.count(body_name) == 1 else f"body_{self.number}"
+        return fitted.scene.unique_names[self.number]
 
     def numbered(self, scene: Scene) -> FreeOfBody:
         return replace(self, body=scene.body_number(self.body))
