@@ -43,7 +43,7 @@ class Shadow:
 
     def __init__(self, spheres: ws.Spheres, size: int):
         blocker = ws.Body(ws.icosphere(0.1, 0), blockers=spheres, rotation=(0, 90, 0), translation=BUNNY)
-        ground = ws.Body(ws.plane(2.4, 24), blockers=0)
+        ground = ws.Body(ws.plane(2.4, 24), blockers=0, receivers="pixel")  # others leap where squares are cut
         sky = ws.synthetic_sky(SUN, sun_radius=6.0)
         camera = ws.Camera.look_at((0, 2.2, 0), (0, 0, 0), up=(0, 0, -1), fov_y=44, size=(size, size))
         self.renderer = TorchRenderer(ws.Scene((blocker, ground), sky, camera, supersampling=1))

@@ -24,7 +24,8 @@ class SharpestCells(NamedTuple):
 
     directions: np.ndarray  # [16, 3]
     light: wp.array  # luminance in channel 0, for cells of 4π/16, vec3 of shape [1, 16]
-    relative_radius: float  # of their cells, over that of cells of 4π/16
+    relative_radius: float  # of the cells by which edges of spheres' shadows go, over that of cells of 4π/16
+    has_footprints: bool  # whether these edges are as wide as footprints: where cells are sharp to spheres
     edge_radius: float  # of the disc by which planes and convex parts cover them [rad]
     power: np.ndarray  # luminance of all cells [direction]
 
@@ -32,7 +33,7 @@ class SharpestCells(NamedTuple):
 def find_sharpest_cells(
     projected_light: ProjectedCells, edge_radius_of: Callable[[SharpCells], float]
 ) -> SharpestCells:
-    """Find the cells of known light whose shadows are sharpest: sharp cells, or else the brightest.
+    """Find the cells of known light whose shadows are sharpest: sharp cells if the brightest is one, or the brightest.
 
     Args:
         projected_light: The light.
@@ -40,19 +41,23 @@ def find_sharpest_cells(
     """
     assert projected_light.coefficients is not None
     power = projected_light.coefficients.numpy()[0] @ LUMINANCE
+    of_planes, of_spheres = (
+        cells if cells is not None and cells.slots[power.argmax()] >= 0 else None
+        for cells in (projected_light.sharp_cells_past_planes, projected_light.sharp_cells)
+    )
     directions, light = np.empty((CHUNK, 3)), np.zeros(CHUNK)
-    if projected_light.sharp_cells_past_planes is None:
+    if of_planes is None:
         chosen = np.sort(np.argsort(-power, kind="stable")[:CHUNK])
         directions, light = projected_light.blocking_directions[chosen], power[chosen]
-        relative_radius = cell_radius(len(power)) / cell_radius(CHUNK)
         edge_radius = cell_radius(len(power))
     else:
-        directions, slots, relative_radius = projected_light.sharp_cells_past_planes
+        directions, slots, _ = of_planes
         light[slots[slots >= 0]] = power[slots >= 0]
-        edge_radius = edge_radius_of(projected_light.sharp_cells_past_planes)
+        edge_radius = edge_radius_of(of_planes)
+    relative_radius = cell_radius(len(power)) / cell_radius(CHUNK) if of_spheres is None else of_spheres.scale
     light = light[:, None] * [CHUNK / len(power), 0, 0]
     on_device = constant(light[None], wp.vec3, projected_light.coefficients.device)
-    return SharpestCells(directions, on_device, relative_radius, edge_radius, power)
+    return SharpestCells(directions, on_device, relative_radius, of_spheres is not None, edge_radius, power)
 
 
 def find_share_of_sharpest_light(
@@ -68,15 +73,14 @@ def find_share_of_sharpest_light(
     Returns:
         Shape [batch, receiver]; None where nothing blocks.
     """
-    directions, light, _, edge_radius, power = sharpest
+    directions, light, _, has_footprints, edge_radius, power = sharpest
     points, normals, centers, radii = group.points, group.normals, group.centers, group.radii
     if not radii.shape[1] and group.planes is None and group.convex_parts_around is None:
         return None
     if radii.shape[1]:
-        arguments = points, normals, centers, radii, directions
-        transmittance = directional.transmittance(
-            *arguments, softness=softness, merging=merging, footprints=group.footprints
-        )
+        footprints = group.footprints if has_footprints else None
+        options: dict[str, Any] = {"softness": softness, "merging": merging, "footprints": footprints}
+        transmittance = directional.transmittance(points, normals, centers, radii, directions, **options)
     else:
         transmittance = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
     coverages = []
@@ -85,7 +89,7 @@ def find_share_of_sharpest_light(
     planes = group.planes
     if planes is not None and group.is_blocked_by_planes:
         front_weights, points = group.fronts_of_planes
-        options: dict[str, Any] = {"radius": edge_radius, "horizon_normals": normals, "front_weights": front_weights}
+        options = {"radius": edge_radius, "horizon_normals": normals, "front_weights": front_weights}
         coverages.append(
             plane_coverage(points, planes.frames, planes.blockers, directions, skip=planes.skip, **options)
         )
