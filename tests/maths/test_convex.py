@@ -169,6 +169,35 @@ def test_a_prism_with_holes_is_cut_into_few_convex_ones(name, thickness):
     assert counts.pop() <= most
 
 
+def slab_with_a_round_hole(edge_count, corner_count):
+    """A regular prism of a corner count, with a round hole of as many edges as told along its axis."""
+    angles = 2 * np.pi * np.arange(edge_count) / edge_count
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    across = 2 * np.pi / corner_count
+    rims = 0.5 * circle, circle * (np.cos(across / 2) / np.cos(angles % across - across / 2))[:, None]
+    here, there = np.arange(edge_count), np.roll(np.arange(edge_count), -1)
+    strip = np.concatenate([np.c_[here, there + edge_count, there], np.c_[here, here + edge_count, there + edge_count]])
+    return trimesh.creation.extrude_triangulation(np.concatenate(rims), strip, 0.2)
+
+
+@pytest.mark.parametrize(("edge_count", "part_count"), [(32, 32), (48, 48), (64, 64), (80, None)])
+def test_a_slab_with_a_round_hole_has_a_prism_for_each_edge_of_the_hole(edge_count, part_count):
+    slab = slab_with_a_round_hole(edge_count, 4)
+    parts = parts_of(slab)
+    assert (parts is None) == (part_count is None)
+    if parts is not None:
+        prisms = [part for part in parts if not part.is_seam]
+        assert len(prisms) == len(parts) - len(prisms) == part_count
+        assert sum(volume_of(slab, part) for part in prisms) == pytest.approx(slab.volume, rel=1e-5)
+
+
+def test_a_washer_of_many_sides_is_a_tube_of_fewer_segments():
+    """One of 32 is as many prisms; one of 48 is a tube whose segments are two or more sides long."""
+    prisms, segments = (parts_of(slab_with_a_round_hole(count, count)) for count in (32, 48))
+    assert len(prisms) == 64 and max(part.gap for part in prisms) == 0
+    assert len(segments) <= 48 and all(part.gap > 0 for part in segments if not part.is_seam)
+
+
 def volume_of(mesh, part):
     """Volume of a part by what is to the left of its edges."""
     corners = mesh.vertices[part.corners]
