@@ -52,13 +52,39 @@ def test_the_layer_is_the_same_of_a_mug_that_is_inside_out_and_turned():
         trimesh.creation.icosphere(3),
         trimesh.creation.torus(1, 0.05, 48, 12),
         trimesh.creation.capsule(2, 0.05, count=[16, 16]),
-        lathed((0, 0), (1, 0), (1.1, 0.1), (1.05, 0.15), (0.98, 0.05), (0, 0.05)),
         lathed((0, 0), (1, 0), (1.02, 0.04), (1, 0.08), (0, 0.08)),
+        lathed((0, 0), (0.9, 0), (1, 0.04), (0.9, 0.08), (0.7, 0.06), (0, 0.06)),
     ],
-    ids=["thick", "ball", "ring", "rod", "plate", "slab"],
+    ids=["thick", "ball", "ring", "rod", "slab", "coin"],
 )
-def test_solids_rods_and_plates_have_no_layer(mesh):
+def test_solids_rods_and_slabs_have_no_layer(mesh):
     assert layer_of(mesh) is None
+
+
+DISHES = {
+    "plate with a foot": [
+        *[(0, 0), (0.3, 0), (0.32, 0.05), (0.55, 0.09), (0.75, 0.17)],
+        *[(0.76, 0.19), (0.54, 0.115), (0.3, 0.075), (0, 0.07)],
+    ],
+    "lid with a knob": [
+        *[(0, 0.03), (0.5, 0), (0.75, -0.05), (0.76, -0.03), (0.5, 0.03), (0.12, 0.055)],
+        *[(0.06, 0.06), (0.05, 0.1), (0.1, 0.14), (0.08, 0.17), (0, 0.18)],
+    ],
+}
+
+
+@pytest.mark.parametrize("profile", DISHES.values(), ids=DISHES)
+@pytest.mark.parametrize("scale", [1, 1e-3])
+def test_the_panels_of_a_dish_leave_no_gaps(profile, scale):
+    mesh = lathed(*profile, sections=40)
+    turn = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])
+    mesh.apply_transform(turn).apply_scale(scale)
+    parts = find_convex_parts(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    assert len({part.piece for part in parts}) == 2
+    corners = [mesh.vertices[part.corners] for part in parts if part.piece == 0]
+    areas = [np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0) @ turn[:3, 2] / 2 for points in corners]
+    radius = max(r for r, _ in profile) * scale
+    assert abs(sum(areas)) == pytest.approx(20 * np.sin(np.pi / 20) * radius**2, rel=0.03)  # along the axis
 
 
 def test_a_mug_blocks_as_panels_for_receivers_outside_and_others_for_receivers_inside():

@@ -1,4 +1,4 @@
-"""Thin walls: closed surfaces around one, such as mugs and bottles, and one layer of them, which blocks for both.
+"""Thin walls: closed surfaces around one, such as mugs and plates, and one layer of them, which blocks for both.
 
 A wall's two layers are where most of a surface has its other side opposite: faces and their opposites are a signed
 graph, in which neighbors should be on one side and opposites on two. The vector of the least eigenvalue of its
@@ -13,11 +13,13 @@ from warpshadow.maths.plane import principal_axes
 MAX_THICKNESS = 0.06
 """Thickness of a wall at most, over the size of the mesh: a mug's has 0.04, a cup's 0.055, a knot's rod 0.09."""
 
-MIN_DEPTH = 0.25
-"""Least extent of a layer along any axis, over its size: plates and slabs, whose thickness is seen, are none."""
+MIN_DEPTH = 1.5
+"""Least extent of a layer along any axis, over the mean thickness: of plates and lids 5 to 8, a tray with a low rim
+1.7; of slabs, whose thickness is seen, 0.8."""
 
-MIN_OPPOSED = 0.9
-"""Share of the surface at least that is on another side than its opposite: of cups and bottles 0.97, a bracket 0.46."""
+MIN_OPPOSED = 0.8
+"""Share of the surface at least that is on another side than its opposite: of cups and bottles 0.97, a plate with a
+foot 0.89, a bracket 0.46."""
 
 MAX_RIM = 0.15
 """Area of the rim between the layers at most, over that of the surface: of a mug 0.02, a bowl 0.09, a rod 0.6."""
@@ -77,7 +79,7 @@ def find_layer(points: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
         is_outer = ~is_outer
     layer = triangles[is_outer]
     places = points[np.unique(layer)]
-    return layer if np.ptp(places @ principal_axes(places).T, axis=0).min() > MIN_DEPTH * size else None
+    return layer if np.ptp(places @ principal_axes(places).T, axis=0).min() > MIN_DEPTH * thickness else None
 
 
 def _opposites(corners: np.ndarray, units: np.ndarray, areas: np.ndarray, thickness: float, reach: float) -> np.ndarray:

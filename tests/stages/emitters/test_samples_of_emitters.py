@@ -357,6 +357,32 @@ def test_convex_parts_block_as_the_twin_does(device):
     assert not none.numpy().any()
 
 
+def test_boards_that_touch_block_as_the_twin_does(device):
+    """As the board that they make together, or as the sum of them where that is less."""
+    count, size, board = 8, (1.2, 0.15, 0.1), (1.2, 1.2, 0.1)
+    middles = np.stack([np.zeros(count), 0.15 * np.arange(count) - 0.525, np.zeros(count)], axis=1)
+    mesh = ws.load_mesh(
+        trimesh.util.concatenate([trimesh.creation.box(size).apply_translation(middle) for middle in middles])
+    )
+    assert mesh.hull_of_parts is not None
+    points = np.random.default_rng(8).uniform(-0.8, 0.8, size=(60, 3)) - (0, 0, 1.5)
+    normals = np.tile([[0, 0, 1.0]], (60, 1))
+    own, got = log_past(mesh, points, normals, device, lamp=(0.2, 0.1, 0.8))
+    sample_points, areas = numbers(own.points), numbers(own.areas)
+    expected, sums = np.zeros(got.shape), np.zeros(got.shape)
+    for receiver, sample in np.ndindex(*got.shape):
+        beam, area = sample_points[sample] - points[receiver], areas[sample]
+        if twins.may_light(beam, area, normals[receiver]):
+            disc = beam, np.sqrt(np.linalg.norm(area) / np.pi)
+            sums[receiver, sample] = sum(
+                twins.share_of_box(size, points[receiver] - middle, *disc) for middle in middles
+            )
+            share = min(sums[receiver, sample], twins.share_of_box(board, points[receiver], *disc))
+            expected[receiver, sample] = np.log(max(1 - share, 1e-4))
+    assert (sums > 1 - np.exp(expected) + 0.05).sum() > 20 and (expected == 0).sum() > 200
+    np.testing.assert_allclose(np.exp(got), np.exp(expected), atol=200 * FLOAT32)
+
+
 def cone(sections, radii=(1.4, 0.9), heights=(-0.7, 0.7)):
     """The wall of a cone around the y axis, of one layer, open above and below."""
     angles = 2 * np.pi * np.arange(sections) / sections
@@ -369,11 +395,12 @@ def cone(sections, radii=(1.4, 0.9), heights=(-0.7, 0.7)):
     return ws.Mesh(np.concatenate(rings), np.concatenate(halves))
 
 
-def log_past(mesh, points, normals, device):
-    """Logarithm of the transmittance past a mesh from receivers to a ball of radius 0.25 in it."""
-    blockers = ConvexBlockers.from_bodies([ConvexBody(mesh.convex_parts, 0)], mesh.vertex_count, device=device)
+def log_past(mesh, points, normals, device, lamp=(0, 0, 0)):
+    """Logarithm of the transmittance past a mesh from receivers to a ball of radius 0.25."""
+    body = ConvexBody(mesh.convex_parts, 0, hull=mesh.hull_of_parts)
+    blockers = ConvexBlockers.from_bodies([body], mesh.vertex_count, device=device)
     samples = samples_of(BALL, device)
-    own = placed(samples, 0.5 * BALL.positions, device)
+    own = placed(samples, 0.5 * BALL.positions + np.float32(lamp), device)
     arrays = [wp.array(item[None], dtype=wp.vec3, device=device) for item in (points, normals)]
     parts = blockers.place(wp.array(mesh.positions[None], dtype=wp.vec3, device=device))
     got = convex_transmittance.find_log_transmittance_of_parts(
