@@ -6,7 +6,7 @@ panels are chords of bent cloth, in which its receivers do not lie.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +27,11 @@ class GroupConvexParts(NamedTuple):
     placed_parts: PlacedParts
     bodies: tuple[int, ...] = ()  # that blockers number, each of which blocks none of its own receivers' light
     on_surface: bool = False  # whether receivers lie on the parts, which are those of one body
+
+    @property
+    def placed_arrays(self) -> Mapping[str, wp.array]:
+        """Where they are."""
+        return {"parts": self.placed_parts.corners}
 
     def number_of(self, body: int) -> int:
         """The number that a body has here; −1 for none."""

@@ -150,19 +150,18 @@ class BounceGatherer:
     def _from_itself(
         self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array
     ) -> wp.array:
-        bodies, spans = group.receiver_bodies, group.spans
-        first_probes = outgoing.probe_form_factors.first_of(spans)
-        if bodies is None or max(first_probes) < 0:  # convex bodies send themselves nothing
+        first_probes = outgoing.probe_form_factors.first_of(group.spans)
+        if max(first_probes, default=-1) < 0:  # convex bodies send themselves nothing
             return others
-        probes = bodies.probe_weights
-        return self_light(outgoing.probe_light, *probes, others, body_spans=spans, first_probes=first_probes)
+        arguments = outgoing.probe_light, *group.probe_weights, others
+        return self_light(*arguments, body_spans=group.spans, first_probes=first_probes)
 
     def _from_planes(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array
     ) -> wp.array:
         planes = outgoing.proxies.planes
         assert planes is not None
-        skip = planes.index_of_body.get(group.spans[0].body) if group.spans else None
+        skip = None if group.body is None else planes.index_of_body.get(group.body)
         if planes.blockers.count == (skip is not None):
             return others
         fronts = group.find_fronts(outgoing.frames, planes.blockers, skip)
@@ -181,7 +180,7 @@ class BounceGatherer:
             return others
         proxies, proxy_radiance = outgoing.placed_proxies, outgoing.proxy_radiance
         softness = self._visibility.softness
-        if group.convex_parts_around is not None:
+        if group.blockers.convex_parts is not None:
             softness = max(softness, _SOFTNESS_OF_PARTS)
         geometry = {"geometry": group.points, "proxies": proxies.radii}
         count = common_batch({**geometry, "light": proxy_radiance, "other light": others})

@@ -69,21 +69,20 @@ def find_share_of_sharpest_light(
         Shape [batch, receiver]; None where nothing blocks.
     """
     directions, light, _, edge_radius, power = sharpest
-    points, normals, centers, radii = group.points, group.normals, group.centers, group.radii
-    if not radii.shape[1] and group.planes is None and group.convex_parts_around is None:
+    points, normals, (spheres, planes, parts, *_) = group.points, group.normals, group.blockers
+    if spheres is None and planes is None and parts is None:
         return None
-    if radii.shape[1]:
-        arguments = points, normals, centers, radii, directions
+    if spheres is not None:
+        arguments = points, normals, spheres.centers, spheres.radii, directions
         transmittance = directional.transmittance(
             *arguments, softness=softness, merging=merging, footprints=group.footprints
         )
     else:
         transmittance = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
     coverages = []
-    if group.convex_parts_around is not None:
+    if parts is not None:
         coverages.append(group.coverage_around(normals, directions, edge_radius))
-    planes = group.planes
-    if planes is not None and group.is_blocked_by_planes:
+    if planes is not None:
         front_weights, points = group.fronts_of_planes
         options: dict[str, Any] = {"radius": edge_radius, "horizon_normals": normals, "front_weights": front_weights}
         coverages.append(

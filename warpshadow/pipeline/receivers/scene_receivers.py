@@ -4,8 +4,8 @@ from collections.abc import Hashable
 
 import numpy as np
 
+from warpshadow.pipeline.bodies.blockers import ONLY_SPHERES, BlockerKinds
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.receivers.shading_context import ONLY_SPHERES, BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.stages.receivers.find import Numbering, number_receivers
 

@@ -10,7 +10,8 @@ from warpshadow.device.batch import common_batch, cut
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.receivers.groups import Blockers, Group
+from warpshadow.pipeline.bodies.blockers import Blockers
+from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.stages.emitters.convex_transmittance import find_log_transmittance_of_parts
 from warpshadow.stages.emitters.emitter_self_visibility import EmitterSelfVisibility, look_up_self_visibility
@@ -113,7 +114,7 @@ def _find_transmittances(
         return
     transmittance_of_cells = (
         transmittance_past(None, group.self_coverage(EMITTER_CELLS))
-        if group.self_blocking_parts is not None
+        if group.blockers.self_parts is not None
         else group.looked_up_transmittance()
     )
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
@@ -227,8 +228,8 @@ def _log_of_planes(
     group: Group, blockers: Blockers, placed_samples: PlacedSamples, span: EmitterSpan, body: int
 ) -> wp.array | None:
     """Logarithm of the transmittance of planes between a group and an emitter; None without any."""
-    planes, numbers = group.planes, blockers.blocker_kinds.planes
-    if planes is None or not group.is_blocked_by_planes:
+    planes, numbers = group.blockers.planes, blockers.blocker_kinds.planes
+    if planes is None:
         return None
     assert blockers.body_sides is not None
     points, sides = group.fronts_of_planes.lifted_points, blockers.body_sides.sides_of(planes.frames, planes.blockers)
@@ -240,7 +241,7 @@ def _log_of_planes(
 
 def _log_of_parts(group: Group, placed_samples: PlacedSamples, span: EmitterSpan, body: int) -> wp.array | None:
     """Logarithm of the transmittance of convex parts between a group and an emitter; None without any."""
-    parts = group.convex_parts_around
+    parts = group.blockers.convex_parts
     if parts is None:
         return None
     skipped = -1 if group.body is None else parts.number_of(group.body), parts.number_of(body)

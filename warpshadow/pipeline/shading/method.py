@@ -13,17 +13,12 @@ import warp as wp
 from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
 from warpshadow.assets.known_light import as_light
 from warpshadow.assets.light import EnvironmentMap
+from warpshadow.pipeline.bodies.blockers import ONLY_SPHERES, BlockerKinds
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
-from warpshadow.pipeline.receivers.shading_context import (
-    ONLY_SPHERES,
-    AdaptiveSurfaces,
-    BlockerKinds,
-    ShadingContext,
-    receiver_text,
-)
+from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.transfers import LightArgument, check_light, shade_free
 from warpshadow.stages.receivers.quadtree import Quadtree

@@ -13,13 +13,15 @@ from warpshadow.assets.known_light import KnownLight
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.constants import IdentityKey
 from warpshadow.device.progress import progress_bar
+from warpshadow.pipeline.bodies.blockers import BlockerKinds, Blockers
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.bodies.self_visibility import SelfLookup
 from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached, identity
-from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_portions
-from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, BlockerKinds, ShadingContext, receiver_text
+from warpshadow.pipeline.receivers.groups import Group, find_portions
+from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, ShadingContext, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
+from warpshadow.pipeline.shading.found_visibility import CellVisibility, HarmonicVisibility
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
@@ -158,7 +160,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     def self_lookups(
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Projected
     ) -> Mapping[int, SelfLookup]:
-        """Self-visibility of receivers of some bodies, :attr:`.ReceiverBodies.lookup`. Differentiable: rotations."""
+        """Self-visibility of receivers of some bodies, by body. Differentiable: rotations."""
 
     @abc.abstractmethod
     def find_visibility(self, group: Group, projected_light: Projected) -> FoundVisibility:
@@ -364,7 +366,7 @@ class VisibilityNode(Node):
     ) -> CellVisibility | HarmonicVisibility:
         with self.timed(call, self._visibility):
             visibility: CellVisibility | HarmonicVisibility = self.method.find_visibility(group, projected_light)
-        if group.planes is not None:
+        if group.blockers.planes is not None:
             with self.timed(call, self._planes):
                 visibility = self.method.find_visibility_past_planes(group, visibility, projected_light)
         return visibility

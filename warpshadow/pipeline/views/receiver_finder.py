@@ -8,8 +8,9 @@ import warp as wp
 from warpshadow.device.constants import constant, gather_of_owners
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.launch import without_gradient
+from warpshadow.pipeline.bodies.blockers import BlockerKinds
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
-from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, BlockerKinds
+from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.image.slopes import find_outline_samples
