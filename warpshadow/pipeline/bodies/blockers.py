@@ -149,8 +149,8 @@ class Blockers(NamedTuple):
         chosen = _choose_blocking(planes, body, of_bodies)
         if self.frames is None or not chosen:
             return None
-        skip = planes.index(body) if body in planes else None
-        return GroupPlanes(self.planes.blockers(planes, chosen), self.frames, skip)
+        self_plane = planes.index(body) if body in planes else None
+        return GroupPlanes(self.planes.blockers(planes, chosen), self.frames, self_plane)
 
     def _convex_parts_around(self, body: int, of_bodies: Iterable[int] | None) -> GroupConvexParts | None:
         bodies = self.blocker_kinds.convex

@@ -54,7 +54,7 @@ class GroupConvexParts(NamedTuple):
             radius=radius,
             horizon_normals=horizon_normals,
             body_spans=spans,
-            skips=[self.number_of(span.body) for span in spans] or [-1],
+            self_bodies=[self.number_of(span.body) for span in spans] or [-1],
             on_surface=self.on_surface,
         )
 

@@ -29,7 +29,7 @@ class GroupPlanes(NamedTuple):
 
     blockers: PlaneBlockers
     frames: wp.array  # where they are, vec3 of shape [batch, 3 · plane]
-    skip: int | None = None  # the one that the receivers are part of
+    self_plane: int | None = None  # the one that the receivers are part of
 
     @property
     def placed_arrays(self) -> Mapping[str, wp.array]:

@@ -161,16 +161,17 @@ class BounceGatherer:
     ) -> wp.array:
         planes = outgoing.proxies.planes
         assert planes is not None
-        skip = None if group.body is None else planes.index_of_body.get(group.body)
-        if planes.blockers.count == (skip is not None):
+        self_plane = None if group.body is None else planes.index_of_body.get(group.body)
+        if planes.blockers.count == (self_plane is not None):
             return others
-        fronts = group.find_fronts(outgoing.frames, planes.blockers, skip)
+        fronts = group.find_fronts(outgoing.frames, planes.blockers, self_plane)
         # Planes are seen through the middles of cells. Through transmittance.directions, where skylight comes from,
         # which are above horizons, a ball on a ground lost 4% of the ground's light.
         middles = fibonacci(len(transmittance.directions))
         arguments = fronts.lifted_points, group.normals, transmittance.transmittance_nonplanar, outgoing.frames
-        options = {"coverages": transmittance.part_coverages, "front_weights": fronts.front_weights, "skip": skip}
-        return plane_light(*arguments, outgoing.texels, planes.blockers, middles, **options, addend=others)
+        options = {"front_weights": fronts.front_weights, "self_plane": self_plane, "addend": others}
+        coverages = transmittance.part_coverages
+        return plane_light(*arguments, outgoing.texels, planes.blockers, middles, **options, coverages=coverages)
 
     def _from_spheres(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array

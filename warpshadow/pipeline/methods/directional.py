@@ -200,7 +200,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         options: dict[str, Any] = {
             "horizon_normals": horizon_normals,
             "front_weights": front_weights,
-            "skip": planes.skip,
+            "self_plane": planes.self_plane,
         }
         covered = self._coverages(
             functools.partial(plane_coverage, points, planes.frames, planes.blockers, **options), projected_light

@@ -86,7 +86,7 @@ def find_share_of_sharpest_light(
         front_weights, points = group.fronts_of_planes
         options: dict[str, Any] = {"radius": edge_radius, "horizon_normals": normals, "front_weights": front_weights}
         coverages.append(
-            plane_coverage(points, planes.frames, planes.blockers, directions, skip=planes.skip, **options)
+            plane_coverage(points, planes.frames, planes.blockers, directions, self_plane=planes.self_plane, **options)
         )
     if coverages:
         transmittance = transmittance_past(transmittance, *coverages)

@@ -77,13 +77,13 @@ class Group:
         """As :meth:`find_fronts`, of the planes around the group."""
         planes = self.blockers.planes
         assert planes is not None
-        return self.find_fronts(planes.frames, planes.blockers, planes.skip)
+        return self.find_fronts(planes.frames, planes.blockers, planes.self_plane)
 
-    def find_fronts(self, frames: wp.array, planes: PlaneBlockers, skip: int | None) -> PlaneFronts:
+    def find_fronts(self, frames: wp.array, planes: PlaneBlockers, self_plane: int | None) -> PlaneFronts:
         """Which part of each plane's front the receivers see, and the receivers lifted off planes they lie in."""
         sides = None if self.blockers.body_sides is None else self.blockers.body_sides.sides_of(frames, planes)
         arguments = self.points, self.normals, sides, self.nearest_blockers, frames, planes
-        return find_fronts(*arguments, spans=self.spans, skip=skip)
+        return find_fronts(*arguments, spans=self.spans, self_plane=self_plane)
 
     def portions(self) -> Iterator[Group]:
         """Portions of the receivers; all of them at once for a gradient, and where they have cached rows.

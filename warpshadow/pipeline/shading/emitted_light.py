@@ -233,7 +233,7 @@ def _log_of_planes(
         return None
     assert blockers.body_sides is not None
     points, sides = group.fronts_of_planes.lifted_points, blockers.body_sides.sides_of(planes.frames, planes.blockers)
-    skipped = -1 if planes.skip is None else planes.skip, numbers.index(body) if body in numbers else -1
+    skipped = -1 if planes.self_plane is None else planes.self_plane, numbers.index(body) if body in numbers else -1
     return find_log_transmittance_of_planes(
         points, group.normals, placed_samples, span, planes.frames, planes.blockers, sides, body, skipped
     )

@@ -189,7 +189,7 @@ def _find_fronts(
     blocker_indices: wp.array(dtype=wp.int32),
     frames: wp.array2d(dtype=wp.vec3),
     grids: wp.array(dtype=PlaneGrid),
-    skip: int,
+    self_plane: int,
     # out
     front_weights: wp.array3d(dtype=wp.float32),
     lifted_points: wp.array2d(dtype=wp.vec3),
@@ -224,7 +224,7 @@ def _find_fronts(
                     side_of_body = body_sides[instance_in(batch, body_sides.shape[0]), body, plane]
                 front = _front_by_height(height, margin, side_of_body, wp.dot(normal, plane_normal))
             relative_height = height / (2.0 * _LIFT_IN_MARGINS * margin)
-            if plane != skip and wp.abs(relative_height) < 1.0:
+            if plane != self_plane and wp.abs(relative_height) < 1.0:
                 nearness = 1.0 - relative_height * relative_height
                 lift = (2.0 * front - 1.0) * nearness * nearness * _LIFT_IN_MARGINS * margin
                 offset += lift * wp.length(axis_u) * plane_normal
@@ -248,7 +248,7 @@ def find_fronts(
     planes: PlaneBlockers,
     *,
     spans: Sequence[Span] = (),
-    skip: int | None = None,
+    self_plane: int | None = None,
 ) -> PlaneFronts:
     """Weight of each plane's front for each receiver, and receivers lifted off planes in which they lie.
 
@@ -260,7 +260,7 @@ def find_fronts(
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`. Any batch
             may be 1.
         spans: Of the receivers, which know their body; () for those of body 0.
-        skip: Number of the plane that the receivers are part of, off which none is lifted; None for none.
+        self_plane: Number of the plane that the receivers are part of, off which none is lifted; None for none.
     Differentiable: points, normals, body_sides, centers and radii of spheres, frames.
     """
     centers, radii, blocker_indices = (None, None, None) if spheres is None else spheres
@@ -275,5 +275,10 @@ def find_fronts(
     of_spans = receiver_spans(spans, points.shape[1], 1, points.device)
     bodies = span_values([span.body for span in spans] or [0], points.device)
     inputs = [points, normals, body_sides, of_spans, bodies, centers, radii, blocker_indices, frames, planes.grids]
-    launch(_find_fronts, shape, inputs=[*inputs, -1 if skip is None else skip], outputs=[front_weights, lifted_points])
+    launch(
+        _find_fronts,
+        shape,
+        inputs=[*inputs, -1 if self_plane is None else self_plane],
+        outputs=[front_weights, lifted_points],
+    )
     return PlaneFronts(front_weights, lifted_points)
