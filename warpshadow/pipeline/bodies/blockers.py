@@ -34,8 +34,8 @@ class BlockerKinds(NamedTuple):
     bulging_bodies: tuple[int, ...] = ()  # bodies out of which their spheres bulge; they are lit at vertices
 
     @property
-    def separate(self) -> set[int]:
-        """Bodies whose receivers are told apart; those lit alike still share a group."""
+    def distinct_bodies(self) -> set[int]:
+        """Bodies whose receivers form spans of their own, since they leave out, or look up, their own body."""
         return {*self.self_traced, *self.solids, *self.planes}
 
 

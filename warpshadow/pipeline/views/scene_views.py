@@ -190,7 +190,7 @@ class SceneViews:
         Differentiable: geometry.
         """
         merged_scene, blocker_kinds, bodies = self._merged_scene, self._blocker_kinds(geometry), self._bodies(geometry)
-        owners = self._receivers.separate_bodies(blocker_kinds)
+        owners = self._receivers.distinct_bodies(blocker_kinds)
         if owners is not None:
             owners = owners[merged_scene.body_of_face[sides % len(merged_scene.body_of_face)]]
         normals = Node("", vertex_normals, bodies[0], merged_scene.faces)

@@ -19,7 +19,7 @@ from warpshadow.device.parallel import split_row
 
 
 class Span(NamedTuple):
-    """Consecutive receivers of one body; body −1 has receivers whose body is not told apart."""
+    """Consecutive receivers of one body; −1 for receivers of bodies that are not distinct."""
 
     body: int
     first: int
