@@ -196,7 +196,7 @@ class BounceGatherer:
             softness=softness,
             merging=self._visibility.merging,
             body_spans=group.spans,
-            skips=[outgoing.proxies.span_of(span.body) for span in group.spans],
+            skips=[outgoing.proxies.range_of(span.body) for span in group.spans],
             clusters=proxies.clusters if is_same else None,
             tangent_planes=proxies.tangent_planes,
             addend=others,

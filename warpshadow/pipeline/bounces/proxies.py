@@ -87,7 +87,7 @@ class Proxies:
             return None
         return SparseMatrix.from_matrix(overlays.before, device=self.merged_scene.device), overlays.distances
 
-    def span_of(self, body: int | None) -> tuple[int, int]:
+    def range_of(self, body: int | None) -> tuple[int, int]:
         """Where the proxies of a body begin and end."""
         first = self.senders.first
         if body in self.senders.bodies:
