@@ -46,9 +46,8 @@ from warpshadow.stages.receivers.body_spans import (
     Span,
     SpanValues,
     receiver_spans,
-    span_of_receiver,
     span_values,
-    value_of_span,
+    value_of_receiver,
 )
 
 _FRONT_RADIUS_RATIO = wp.constant(1.25)
@@ -220,7 +219,7 @@ def _find_fronts(
             else:
                 side_of_body = float(1.0)
                 if body_sides:
-                    body = value_of_span(body_of_span, span_of_receiver(spans, receiver))
+                    body = value_of_receiver(body_of_span, spans, receiver)
                     side_of_body = body_sides[instance_in(batch, body_sides.shape[0]), body, plane]
                 front = _front_by_height(height, margin, side_of_body, wp.dot(normal, plane_normal))
             relative_height = height / (2.0 * _LIFT_IN_MARGINS * margin)

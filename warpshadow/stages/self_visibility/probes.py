@@ -22,9 +22,8 @@ from warpshadow.stages.receivers.body_spans import (
     Span,
     SpanValues,
     receiver_spans,
-    span_of_receiver,
     span_values,
-    value_of_span,
+    value_of_receiver,
 )
 
 _EVEN_FACES = 10_000
@@ -200,7 +199,7 @@ def _find_vertex_weights(
 ):
     """A thread owns a receiver at a vertex."""
     receiver = wp.tid()
-    table = tables[value_of_span(table_of_span, span_of_receiver(spans, receiver))]
+    table = tables[value_of_receiver(table_of_span, spans, receiver)]
     vertex, is_back = split_side(vertices[receiver], vertex_count)
     row = vertex - table.first_vertex + wp.where(is_back, table.probe_count, 0)
     rows[0, receiver] = wp.vec3i(row, row, row)
@@ -263,7 +262,7 @@ def _find_sample_weights(
 ):
     """A thread owns a receiver at a fragment, −1 for none."""
     batch, receiver = wp.tid()
-    table = tables[value_of_span(table_of_span, span_of_receiver(spans, receiver))]
+    table = tables[value_of_receiver(table_of_span, spans, receiver)]
     face, is_back = split_side(wp.max(sides[batch, receiver], table.first_face), face_count)
     corners, piece_weights = _find_piece(table.pieces, face - table.first_face, barycentrics[batch, receiver])
     back_offset = wp.where(is_back, table.probe_count, 0)
