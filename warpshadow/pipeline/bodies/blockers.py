@@ -34,6 +34,11 @@ class BlockerKinds(NamedTuple):
     bulging_bodies: tuple[int, ...] = ()  # bodies out of which their spheres bulge; they are lit at vertices
 
     @property
+    def without_spheres(self) -> set[int]:
+        """Bodies that block the light of others by something else than their spheres."""
+        return {*self.planes, *self.convex}
+
+    @property
     def distinct_bodies(self) -> set[int]:
         """Bodies whose receivers form spans of their own, since they leave out, or look up, their own body."""
         return {*self.self_traced, *self.solids, *self.planes}
@@ -117,8 +122,7 @@ class Blockers(NamedTuple):
 
     def sphere_blockers(self, bodies: Iterable[int]) -> list[int]:
         """Bodies among some that block light by their spheres."""
-        others = {*self.blocker_kinds.planes, *self.blocker_kinds.convex}
-        return [body for body in bodies if body not in others]
+        return [body for body in bodies if body not in self.blocker_kinds.without_spheres]
 
     def spheres_of(self, bodies: Iterable[int], self_traced: Iterable[int] = ()) -> GroupSpheres | None:
         """Spheres by which some bodies block light; None without any.

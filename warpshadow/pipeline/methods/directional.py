@@ -99,21 +99,22 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     def find_visibility(self, group: Group, projected_light: ProjectedCells) -> CellVisibility:
         """Transmittance of a group past its own body, spheres and convex parts."""
         directions = projected_light.blocking_directions
+        spheres, planes, convex_parts, _self_parts, _self_lookup, _body_sides = group.blockers
         transmittance_self = self._transmittance_self(group, projected_light)
         # cached cells have light although their middles are below the horizon
         horizon_normals = group.normals if group.cached_rows is None else None
         past_spheres, parts = transmittance_self, None
-        if group.blockers.spheres is not None:
-            of_spheres = self._past_spheres(group, group.blockers.spheres, horizon_normals, projected_light)
-            past_spheres = of_spheres if past_spheres is None else multiply_transmittances(past_spheres, of_spheres)
-        if group.blockers.convex_parts is not None:
+        if spheres is not None:
+            factor = self._past_spheres(group, spheres, horizon_normals, projected_light)
+            past_spheres = factor if past_spheres is None else multiply_transmittances(past_spheres, factor)
+        if convex_parts is not None:
             cover = functools.partial(group.coverage_around, horizon_normals)
             parts = self._coverages(cover, projected_light)
         found = CellVisibility(
             directions, None, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
         )
         # planes multiply their share in later; only bounces need the product without them, too
-        if group.blockers.planes is not None and not self.merged_scene.scene.bounces:
+        if planes is not None and not self.merged_scene.scene.bounces:
             return found
         total = past_spheres if parts is None else self._past_coverages(past_spheres, parts, None, projected_light)
         if total is None:

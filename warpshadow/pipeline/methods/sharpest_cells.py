@@ -69,7 +69,8 @@ def find_share_of_sharpest_light(
         Shape [batch, receiver]; None where nothing blocks.
     """
     directions, light, _, edge_radius, power = sharpest
-    points, normals, (spheres, planes, parts, *_) = group.points, group.normals, group.blockers
+    points, normals = group.points, group.normals
+    spheres, planes, parts, _self_parts, _self_lookup, _body_sides = group.blockers  # none is of a flat body itself
     if spheres is None and planes is None and parts is None:
         return None
     if spheres is not None:

@@ -11,6 +11,8 @@ from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bodies.blockers import Blockers
+from warpshadow.pipeline.bodies.convex import GroupConvexParts
+from warpshadow.pipeline.bodies.scene_planes import GroupPlanes
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.stages.emitters.convex_transmittance import find_log_transmittance_of_parts
@@ -112,9 +114,10 @@ def _find_transmittances(
     merged_scene, points, normals = blockers.merged_scene, group.points, group.normals
     if not points.size:
         return
+    _spheres, planes, convex_parts, self_parts, _self_lookup, _body_sides = group.blockers
     transmittance_of_cells = (
         transmittance_past(None, group.self_coverage(EMITTER_CELLS))
-        if group.blockers.self_parts is not None
+        if self_parts is not None
         else group.looked_up_transmittance()
     )
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
@@ -156,8 +159,8 @@ def _find_transmittances(
             span,
             find_transmittance_to_samples(
                 log_of_spheres=find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped),
-                log_of_planes=_log_of_planes(group, blockers, placed_samples, span, body),
-                log_of_parts=_log_of_parts(group, placed_samples, span, body),
+                log_of_planes=planes and _log_of_planes(group, planes, blockers, placed_samples, span, body),
+                log_of_parts=convex_parts and _log_of_parts(group, convex_parts, placed_samples, span, body),
                 transmittance_self=transmittance_self,
                 transmittance_of_emitter=weigh_by_beam(points, placed_samples, span, transmittance_of_emitter),
             ),
@@ -225,12 +228,10 @@ def trace_transmittances(
 
 
 def _log_of_planes(
-    group: Group, blockers: Blockers, placed_samples: PlacedSamples, span: EmitterSpan, body: int
-) -> wp.array | None:
-    """Logarithm of the transmittance of planes between a group and an emitter; None without any."""
-    planes, numbers = group.blockers.planes, blockers.blocker_kinds.planes
-    if planes is None:
-        return None
+    group: Group, planes: GroupPlanes, blockers: Blockers, placed_samples: PlacedSamples, span: EmitterSpan, body: int
+) -> wp.array:
+    """Logarithm of the transmittance of planes between a group and an emitter."""
+    numbers = blockers.blocker_kinds.planes
     assert blockers.body_sides is not None
     points, sides = group.fronts_of_planes.lifted_points, blockers.body_sides.sides_of(planes.frames, planes.blockers)
     skipped = -1 if planes.self_plane is None else planes.self_plane, numbers.index(body) if body in numbers else -1
@@ -239,11 +240,10 @@ def _log_of_planes(
     )
 
 
-def _log_of_parts(group: Group, placed_samples: PlacedSamples, span: EmitterSpan, body: int) -> wp.array | None:
-    """Logarithm of the transmittance of convex parts between a group and an emitter; None without any."""
-    parts = group.blockers.convex_parts
-    if parts is None:
-        return None
+def _log_of_parts(
+    group: Group, parts: GroupConvexParts, placed_samples: PlacedSamples, span: EmitterSpan, body: int
+) -> wp.array:
+    """Logarithm of the transmittance of convex parts between a group and an emitter."""
     skipped = -1 if group.body is None else parts.number_of(group.body), parts.number_of(body)
     return find_log_transmittance_of_parts(
         group.points, group.normals, placed_samples, span, parts.placed_parts, parts.blockers, skipped

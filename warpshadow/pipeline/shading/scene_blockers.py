@@ -103,7 +103,7 @@ class SceneBlockers:
     def _sphere_counts(self, kinds: BlockerKinds) -> np.ndarray:
         """Number of spheres by which each body blocks the light of others."""
         counts = self._merged_scene.sphere_counts.copy()
-        counts[[*kinds.planes, *kinds.convex]] = 0
+        counts[list(kinds.without_spheres)] = 0
         return counts
 
     def _part_counts(self, kinds: BlockerKinds) -> np.ndarray:
