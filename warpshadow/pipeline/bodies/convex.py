@@ -25,7 +25,7 @@ class GroupConvexParts(NamedTuple):
 
     blockers: ConvexBlockers
     placed_parts: PlacedParts
-    bodies: tuple[int, ...] = ()  # that blockers number, each of which blocks none of its own receivers' light
+    bodies: tuple[int, ...] = ()  # as ``blockers`` numbers them; each blocks no light of receivers that lie on it
     on_surface: bool = False  # whether receivers lie on the parts, which are those of one body
 
     @property

@@ -110,17 +110,17 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         if convex_parts is not None:
             cover = functools.partial(group.coverage_around, horizon_normals)
             parts = self._coverages(cover, projected_light)
-        found = CellVisibility(
+        visibility = CellVisibility(
             directions, None, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
         )
         # planes multiply their share in later; only bounces need the product without them, too
         if planes is not None and not self.merged_scene.scene.bounces:
-            return found
+            return visibility
         total = past_spheres if parts is None else self._past_coverages(past_spheres, parts, None, projected_light)
         if total is None:
             total = empty((*group.points.shape, len(directions)), dtype=wp.float32, device=group.points.device)
             total.fill_(1.0)
-        return found._replace(transmittance_total=total)
+        return visibility._replace(transmittance_total=total)
 
     def _coverages(self, cover: Callable[..., wp.array], projected_light: ProjectedCells) -> CellCoverages:
         """Coverage of all cells and of sharp ones."""
@@ -138,13 +138,13 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         projected_light: ProjectedCells,
     ) -> wp.array:
         """Transmittance past blockers that cover cells, and others that may cover the same parts of them."""
-        of_others = (None, None) if others is None else others
+        other_coverages = (None, None) if others is None else others
         sharp_cells = projected_light.sharp_cells_past_planes
         if sharp_cells is None or coverages.sharp_cells is None:
-            return transmittance_past(transmittance, coverages.all_cells, of_others[0])
+            return transmittance_past(transmittance, coverages.all_cells, other_coverages[0])
         blended = blend_sharp_cells(
-            transmittance_past(None, coverages.all_cells, of_others[0]),
-            transmittance_past(None, coverages.sharp_cells, of_others[1]),
+            transmittance_past(None, coverages.all_cells, other_coverages[0]),
+            transmittance_past(None, coverages.sharp_cells, other_coverages[1]),
             sharp_cells.slots,
             projected_light.spot_shares,
         )
@@ -233,8 +233,8 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
                 'have, expected "traced" or "spheres"'
             )
         assert group.body is not None
-        of_sun = trace_sun_cells(rays[0], group.probe_weights, rays[1], group.body, projected_light.sun)
-        return blend_sharp_cells(transmittance_self, of_sun, projected_light.sun.slots)
+        sun_transmittance = trace_sun_cells(rays[0], group.probe_weights, rays[1], group.body, projected_light.sun)
+        return blend_sharp_cells(transmittance_self, sun_transmittance, projected_light.sun.slots)
 
     def transfer(self, visibility: CellVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Transfer vectors; the transmittance as it is where cached cells hold known light."""
@@ -306,9 +306,9 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         points, normals = static_bodies.gathered(vertices, normals)
         numbers = split_sides(vertices, len(static_bodies.has_vertex))[0]
         arrays = from_numpy(static_bodies.ray_origins[numbers], dtype=wp.vec3, device=points.device), normals[0]
-        of_points = wp.array(numbers, dtype=wp.int32, device=points.device)
+        vertex_numbers = wp.array(numbers, dtype=wp.int32, device=points.device)
         samples = self._lit_samples if is_scene_light else self._even_samples
-        return trace_cells(static_bodies.mesh, *arrays, of_points, samples, progress=self.progress)
+        return trace_cells(static_bodies.mesh, *arrays, vertex_numbers, samples, progress=self.progress)
 
     @functools.cached_property
     def _lit_samples(self) -> CellSamples:

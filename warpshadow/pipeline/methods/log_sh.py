@@ -134,16 +134,16 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
         self_visibility = self.scene_blockers.self_visibility
         turned = self_visibility.turned_lobes(traced_bodies, static_bodies.rotations, self._order)
         for body in np.unique(bodies).tolist():
-            of_body = np.flatnonzero(bodies == body)
-            arguments = static_bodies.gathered(vertices[of_body], normals)
+            chosen_rows = np.flatnonzero(bodies == body)
+            arguments = static_bodies.gathered(vertices[chosen_rows], normals)
             others = [other for other in static_bodies.bodies if not (other == body and body in traced)]
-            rows[of_body, 0] = self._logs(*arguments, *static_bodies.spheres_of(others)).numpy()[0]
+            rows[chosen_rows, 0] = self._logs(*arguments, *static_bodies.spheres_of(others)).numpy()[0]
             if body in turned:
-                weights = self_visibility.probe_weights_of(body, vertices[of_body])
+                weights = self_visibility.probe_weights_of(body, vertices[chosen_rows])
                 result = turned[body].of_receivers(weights, order=self._order)
             else:
                 result = sh_transfer(None, arguments[1], order=self._order)
-            rows[of_body, 1] = result.numpy()[0]
+            rows[chosen_rows, 1] = result.numpy()[0]
         return wp.array(rows, dtype=wp.float32, device=device)
 
     def _logs(

@@ -166,16 +166,16 @@ def find_portions(
         assert static_normals is not None
         moving = static_bodies.moving
         points_and_normals = static_bodies.receivers(receivers.static_vertices, static_normals)
-        blockers_around = blockers.around(of_bodies=moving)._replace(spheres=blockers.spheres_of(moving))
-        yield from Group(*points_and_normals, blockers_around, cached_rows=cached_rows).portions()
+        group_blockers = blockers.around(of_bodies=moving)._replace(spheres=blockers.spheres_of(moving))
+        yield from Group(*points_and_normals, group_blockers, cached_rows=cached_rows).portions()
         if not receivers.points.shape[1]:
             return
     nearest_blockers = _nearest_blockers(nearest_spheres, blockers)
     if receivers.spans:
         groups = _groups_by_body(receivers, blockers, self_lookups or {}, nearest_blockers, by_body)
     else:
-        around = blockers.around()._replace(spheres=blockers.spheres_of(blockers.bodies))
-        arrays = receivers.points, receivers.normals, around if receivers.points.size else GroupBlockers()
+        group_blockers = blockers.around()._replace(spheres=blockers.spheres_of(blockers.bodies))
+        arrays = receivers.points, receivers.normals, group_blockers if receivers.points.size else GroupBlockers()
         groups = iter([Group(*arrays, receivers.footprints, nearest_blockers=nearest_blockers)])
     for group in groups:
         yield from group.portions()
@@ -202,19 +202,19 @@ def _groups_by_body(
     def key_of(span: Span) -> GroupKey:
         body, lookup = span.body, self_lookups.get(span.body)
         blocks_alone = spheres is None or spheres.ranges.get(body) == (0, spheres.radii.shape[1])
-        around = blockers.around(body)._replace(
+        group_blockers = blockers.around(body)._replace(
             spheres=None if blocks_alone else clustered_spheres(),
             self_lookup=lookup,
             body_sides=blockers.body_sides if body >= 0 else None,
         )
         if body < 0:
-            return GroupKey(span.first < vertex_count, False, None, around)
+            return GroupKey(span.first < vertex_count, False, None, group_blockers)
         # where light bounces, these shadow themselves by their spheres (find_cell_transmittance)
         has_self_spheres = merged_scene.scene.bounces and lookup is None and body not in kinds.solids
-        is_of_one_body = around.self_parts is not None or (lookup is not None and lookup.is_of_one_body)
+        is_of_one_body = group_blockers.self_parts is not None or (lookup is not None and lookup.is_of_one_body)
         is_alone = by_body or merged_scene.is_flat[body] or has_self_spheres or is_of_one_body
         is_glossy = bool(merged_scene.is_glossy[body])
-        return GroupKey(span.first < vertex_count, is_glossy, body if is_alone else None, around)
+        return GroupKey(span.first < vertex_count, is_glossy, body if is_alone else None, group_blockers)
 
     for key, consecutive in itertools.groupby(receivers.spans, key_of):
         spans = tuple(consecutive)

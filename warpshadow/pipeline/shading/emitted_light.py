@@ -91,11 +91,11 @@ def find_highlights(
         end = first + portion.points.shape[1]
         seen = portion.points, portion.normals, cut(roughness, first, end), clip_matrices
         zeros = wp.zeros(portion.points.shape, dtype=wp.vec3, device=portion.points.device)
-        of_emitters = [
+        emitter_sums = [
             sum_highlights(*seen, placed_samples, radiance, *pair)
             for pair in _find_transmittances(emitters, self_visibility, portion, blockers, placed_samples)
         ]
-        sums.append([add_light(zeros, *parts) for parts in zip(*of_emitters, strict=True)] or [zeros, zeros])
+        sums.append([add_light(zeros, *parts) for parts in zip(*emitter_sums, strict=True)] or [zeros, zeros])
         first = end
     return LobeLight(*(join_portions(list(portions)) for portions in zip(*sums, strict=True)))
 
@@ -177,12 +177,14 @@ def _find_where_enclosed(blockers: Blockers, emitter: int, body: int | None) -> 
     starts = blockers.merged_scene.first_vertex
     if is_readable(blockers.positions.device):
         positions = blockers.positions.numpy()
-        of_emitter, of_body = (positions[:, starts[number] : starts[number + 1]] for number in (emitter, body))
+        emitter_positions, body_positions = (
+            positions[:, starts[number] : starts[number + 1]] for number in (emitter, body)
+        )
     else:
         bodies = blockers.merged_scene.scene.bodies
-        of_emitter, of_body = (bodies[number].world_points()[None] for number in (emitter, body))
-    middle = (of_emitter.min(axis=1) + of_emitter.max(axis=1)) / 2
-    is_within: np.ndarray = ((of_body.min(axis=1) < middle) & (middle < of_body.max(axis=1))).all(axis=1)
+        emitter_positions, body_positions = (bodies[number].world_points()[None] for number in (emitter, body))
+    middle = (emitter_positions.min(axis=1) + emitter_positions.max(axis=1)) / 2
+    is_within: np.ndarray = ((body_positions.min(axis=1) < middle) & (middle < body_positions.max(axis=1))).all(axis=1)
     return is_within
 
 

@@ -271,9 +271,9 @@ def find_fronts(
     shape = common_batch({**arguments, "body_sides": body_sides}), points.shape[1]
     front_weights = empty((*shape, planes.count), dtype=wp.float32, device=points.device)
     lifted_points = empty(shape, dtype=wp.vec3, device=points.device)
-    of_spans = receiver_spans(spans, points.shape[1], 1, points.device)
+    kernel_spans = receiver_spans(spans, points.shape[1], 1, points.device)
     bodies = span_values([span.body for span in spans] or [0], points.device)
-    inputs = [points, normals, body_sides, of_spans, bodies, centers, radii, blocker_indices, frames, planes.grids]
+    inputs = [points, normals, body_sides, kernel_spans, bodies, centers, radii, blocker_indices, frames, planes.grids]
     launch(
         _find_fronts,
         shape,

@@ -177,7 +177,7 @@ def _cut_faces(
 
 @wp.struct
 class ProbeTable:
-    """By which receivers of a body find their probes."""
+    """Pieces of the faces of one body, and where its vertices, faces and probes begin."""
 
     first_vertex: int  # of the body's vertices among all
     first_face: int  # likewise of its faces
@@ -271,7 +271,7 @@ def _find_sample_weights(
 
 
 class ProbeTables(NamedTuple):
-    """By which receivers of some bodies find their probes."""
+    """Tables of some bodies, in which their receivers find the probes around them."""
 
     tables: tuple[ProbeTable, ...]  # of each body
     table: wp.array  # the same on the device
@@ -300,9 +300,10 @@ class ProbeTables(NamedTuple):
     def of_vertices(
         self, vertices: wp.array, spans: Sequence[Span] = (), table_of_span: Sequence[int] = (0,)
     ) -> ProbeWeights:
-        """Weights of vertices and their backs, int32 of shape [receiver], indices among all vertices: batch 1.
+        """Probe weights of receivers at vertices, of batch 1.
 
         Args:
+            vertices: Indices among all vertices, after which their backs are numbered, int32 of shape [receiver].
             spans: Of the receivers, by body; () for one of all.
             table_of_span: The number of each span's body among those of the tables.
         """
