@@ -80,7 +80,10 @@ class GroupSpheres(NamedTuple):
 
 
 class GroupBlockers(NamedTuple):
-    """Blockers around a group of receivers, None for a kind that blocks nothing; each leaves out its own receivers."""
+    """Blockers around a group of receivers, by kind; None where none of a kind blocks their light.
+
+    A body blocks light of receivers that lie on it by ``self_parts`` and ``self_lookup`` alone, or by its spheres.
+    """
 
     spheres: GroupSpheres | None = None
     planes: GroupPlanes | None = None

@@ -32,7 +32,7 @@ RECEIVERS_AT_ONCE = 1 << 13  # receivers of each instance that are lit at once w
 class Group:
     """Receivers that the same launches light.
 
-    Each array has an item for each receiver [batch, receiver]; all other values hold for all receivers.
+    Arrays have an item for each receiver, [batch, receiver]: :meth:`portions` cuts them. Blockers hold for all.
     """
 
     points: wp.array  # vec3
@@ -41,7 +41,7 @@ class Group:
     footprints: wp.array | None = None  # vec3, areas for which receivers stand; None for points
     spans: tuple[Span, ...] = ()  # the receivers by body; () where their bodies are not known
     first: int = 0  # number of the first receiver among all that are not on static bodies
-    nearest_blockers: NearestBlockers | None = None  # of the receivers; None where they are not patch samples
+    nearest_blockers: NearestBlockers | None = None  # of each receiver; None where they are not patch samples
     body: int | None = None  # the only one on which receivers lie; None where there may be several
     is_glossy: bool = False  # whether the bodies shine
     cached_rows: CachedRows | None = None  # of static bodies, which block the receivers' light, too
