@@ -127,7 +127,7 @@ class Blockers(NamedTuple):
         """Bodies among some that block light by their spheres."""
         return [body for body in bodies if body not in self.blocker_kinds.without_spheres]
 
-    def spheres_of(self, bodies: Iterable[int], self_traced: Iterable[int] = ()) -> GroupSpheres | None:
+    def group_spheres(self, bodies: Iterable[int], self_traced: Iterable[int] = ()) -> GroupSpheres | None:
         """Spheres by which some bodies block light; None without any.
 
         Args:

@@ -166,7 +166,7 @@ def find_portions(
         assert static_normals is not None
         moving = static_bodies.moving
         points_and_normals = static_bodies.receivers(receivers.static_vertices, static_normals)
-        group_blockers = blockers.around(of_bodies=moving)._replace(spheres=blockers.spheres_of(moving))
+        group_blockers = blockers.around(of_bodies=moving)._replace(spheres=blockers.group_spheres(moving))
         yield from Group(*points_and_normals, group_blockers, cached_rows=cached_rows).portions()
         if not receivers.points.shape[1]:
             return
@@ -174,7 +174,7 @@ def find_portions(
     if receivers.spans:
         groups = _groups_by_body(receivers, blockers, self_lookups or {}, nearest_blockers, by_body)
     else:
-        group_blockers = blockers.around()._replace(spheres=blockers.spheres_of(blockers.bodies))
+        group_blockers = blockers.around()._replace(spheres=blockers.group_spheres(blockers.bodies))
         arrays = receivers.points, receivers.normals, group_blockers if receivers.points.size else GroupBlockers()
         groups = iter([Group(*arrays, receivers.footprints, nearest_blockers=nearest_blockers)])
     for group in groups:
@@ -192,7 +192,7 @@ def _groups_by_body(
     assert receivers.vertices is not None
     footprints = receivers.footprints
     vertex_count, kinds, merged_scene = receivers.vertices.size, blockers.blocker_kinds, blockers.merged_scene
-    spheres = blockers.spheres_of(blockers.bodies, kinds.self_traced)
+    spheres = blockers.group_spheres(blockers.bodies, kinds.self_traced)
     find_probe_weights = functools.partial(blockers.self_visibility.probe_weights, receivers)
 
     @functools.cache
