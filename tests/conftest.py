@@ -169,7 +169,7 @@ def gpu_branches(monkeypatch):
         parallel.launch_slices: launch_whole,
         parallel.launch_adjoint_slices: launch_whole_adjoint,
         lanes.lane_count: lambda device: 1,
-        lanes.span_count: lambda device, direction_count: direction_count // lanes.CHUNK,
+        lanes.sector_count: lambda device, direction_count: direction_count // lanes.CHUNK,
         cuda_graph.is_readable: lambda device: False,
     }
     for module in [module for name, module in sys.modules.items() if name.startswith("warpshadow")]:

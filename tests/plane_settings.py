@@ -152,7 +152,7 @@ class MetSide(NamedTuple):
     flat: int
 
 
-def met_sides(point, omega, disc, radius, frames, grids, radiosity, skip, fronts=None):
+def met_sides(point, omega, disc, radius, frames, grids, radiosity, self_plane, fronts=None):
     """The sides that a cell meets."""
     sides = []
     for f, grid in enumerate(grids):
@@ -166,7 +166,7 @@ def met_sides(point, omega, disc, radius, frames, grids, radiosity, skip, fronts
         front = ramp(1 + 2 * height / margin) if fronts is None else fronts[f]
         for side, side_weight in ((1, front), (-1, 1 - front)):
             away = -side * normal
-            if f == skip or side_weight <= 0 or away @ omega <= -radius:
+            if f == self_plane or side_weight <= 0 or away @ omega <= -radius:
                 continue
             rise = np.clip(side * height / margin, 0, 2)
             above = margin * (1 + rise**2 / 4) + max(side * height - 2 * margin, 0)
@@ -230,7 +230,7 @@ def above_horizon(omega, normal, radius):
 
 
 def twin_light(
-    points, normals, transmittance, frames, grids, radiosity, directions, skip=None, fronts=None, coverages=None
+    points, normals, transmittance, frames, grids, radiosity, directions, self_plane=None, fronts=None, coverages=None
 ):
     """Of one instance, [receiver, 3]; radiosity is [side, row, column, 3] for each flat."""
     radius, result = cell_radius(len(directions)), np.zeros((len(points), 3))
@@ -240,8 +240,8 @@ def twin_light(
             if weight == 0:
                 continue
             own = None if fronts is None else fronts[receiver]
-            seen = (omega, radius) if skip is None else above_horizon(omega, normal, radius)
-            sides = met_sides(point, *seen, radius, frames, grids, radiosity, skip, own)
+            seen = (omega, radius) if self_plane is None else above_horizon(omega, normal, radius)
+            sides = met_sides(point, *seen, radius, frames, grids, radiosity, self_plane, own)
             before = np.zeros(4) if coverages is None else coverages[receiver, q]
             seen_parts = [seen_of(*seen, sides, k, before) for k in range(len(sides))]
             shares = sum(share for share, _ in seen_parts)
@@ -251,7 +251,7 @@ def twin_light(
     return result
 
 
-def twin_passing(points, transmittance, frames, grids, blocks, directions, skip=None, fronts=None):
+def twin_passing(points, transmittance, frames, grids, blocks, directions, self_plane=None, fronts=None):
     radius, covered = cell_radius(len(directions)), np.zeros(np.shape(transmittance))
     black = [np.zeros((2, *grid.covered.shape, 3)) for grid in grids]
     for receiver, point in enumerate(points):
@@ -259,7 +259,7 @@ def twin_passing(points, transmittance, frames, grids, blocks, directions, skip=
             if transmittance[receiver, q] == 0:
                 continue
             own = None if fronts is None else fronts[receiver]
-            for side in met_sides(point, omega, radius, radius, frames, grids, black, skip, own):
+            for side in met_sides(point, omega, radius, radius, frames, grids, black, self_plane, own):
                 covered[receiver, q] += side.coverage[0] * blocks[side.flat]
     return transmittance * np.maximum(0, 1 - covered)
 
@@ -348,12 +348,12 @@ class Setting:
             [weights[a:b].astype(float) @ vertices[columns[a:b]] for a, b in zip(starts[:-1], starts[1:], strict=True)]
         )
 
-    def light(self, skip=None, batch=0):
+    def light(self, self_plane=None, batch=0):
         at = self.points[batch], self.normals[batch], self.transmittance[batch]
-        given = self.frames(self.vertices[batch]), self.grids, self.radiosity, DIRECTIONS, skip
+        given = self.frames(self.vertices[batch]), self.grids, self.radiosity, DIRECTIONS, self_plane
         return twin_light(*at, *given, self.fronts, self.coverages)
 
-    def passing(self, skip=None, batch=0):
+    def passing(self, self_plane=None, batch=0):
         at = self.points[batch], self.transmittance[batch]
-        given = self.frames(self.vertices[batch]), self.grids, self.blocks, DIRECTIONS, skip, self.fronts
+        given = self.frames(self.vertices[batch]), self.grids, self.blocks, DIRECTIONS, self_plane, self.fronts
         return twin_passing(*at, *given)

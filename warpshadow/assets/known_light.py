@@ -50,6 +50,11 @@ class HarmonicLight:
         return None
 
     @property
+    def as_map(self) -> EnvironmentMap | None:
+        """None: it has no pixels."""
+        return None
+
+    @property
     def as_argument(self) -> np.ndarray:
         """The light as scenes and renderers take it: its coefficients."""
         return self.coefficients

@@ -175,6 +175,11 @@ class EnvironmentMap(metaclass=check.Hinting):
         return None if self.radius is None else np.array([*self.center, self.radius], np.float32)
 
     @property
+    def as_map(self) -> EnvironmentMap:
+        """The map itself: only light that is one has pixels, to which suns are added."""
+        return self
+
+    @property
     def as_argument(self) -> EnvironmentMap:
         """The light as scenes and renderers take it: the map itself."""
         return self

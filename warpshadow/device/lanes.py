@@ -174,8 +174,8 @@ def block_count(receiver_count: int, lanes: int) -> int:
     return -(-receiver_count // lanes)
 
 
-def span_count(device: wp.Device, direction_count: int) -> int:
-    """Threads of a block of receivers, a span of directions each: on a CPU one, which finds a sphere's cone once."""
+def sector_count(device: wp.Device, direction_count: int) -> int:
+    """Threads of a block of receivers, a *sector* of directions each: on a CPU one, so that a cone is found once."""
     return 1 if device.is_cpu else direction_count // CHUNK
 
 

@@ -142,7 +142,7 @@ def run_dimensions(device: wp.Device, run_count: int, instances: int) -> tuple[i
     CPU: runs are outer. One slice owns a run for all instances, so no other adds to the gradient of inputs that serve
     them all. GPU: instances are outer. The 32 threads of a warp own adjacent samples.
 
-    A run may also be a receiver, and spans of directions take the place of instances: a warp then asks for the same
+    A run may also be a receiver, and sectors of directions take the place of instances: a warp then asks for the same
     directions at adjacent receivers, and its threads go the same way.
     """
     return (instances, run_count) if device.is_cuda else (run_count, instances)
@@ -150,7 +150,7 @@ def run_dimensions(device: wp.Device, run_count: int, instances: int) -> tuple[i
 
 @wp.func
 def split_launch(worker: int, row: int, column: int):
-    """Instance (or span) and run (or receiver) of a thread, by the row and column of a launch of `run_dimensions`."""
+    """Instance (or sector) and run (or receiver) of a thread, by the row and column of a launch of `run_dimensions`."""
     return wp.where(worker < 0, row, column), wp.where(worker < 0, column, row)
 
 

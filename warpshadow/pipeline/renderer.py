@@ -380,8 +380,8 @@ class SceneRenderer:
             geometry = replace(geometry, moving=None)  # else static catchers would be lit in another way than alone
         view = self._views.view(geometry, inputs.clip_matrices)
         light = self._method.light_input(view, inputs.light, inputs.shell)
-        of_catchers = catchers.light(replace(inputs, geometry=alone), view)
-        unshadowed = Input("light without the others", of_catchers)
+        catcher_light = catchers.light(replace(inputs, geometry=alone), view)
+        unshadowed = Input("light without the others", catcher_light)
         photo_input = None if photograph is None else Input("photograph", photograph)
         arguments = photo_input, unshadowed, catchers.has_face, light, materials
         return view.in_photograph(*arguments).value(self._views.call(view))
@@ -477,10 +477,10 @@ class SceneRenderer:
         materials = self.materials(inputs.of_bodies)
         image = preview.image(light, materials)
         is_host = self.device.is_cpu or self.clock.waits
-        of_receivers = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging_bodies)
-        of_bounces = self._transport.notes(preview, light, materials)
-        of_blockers = self._method.blocker_notes(view.blocker_kinds)
-        notes = [*of_receivers, *of_blockers, *of_bounces, *shell_notes(self.scene.shell)]
+        receiver_lines = receiver_notes(self._given_scene, self._choices, view.blocker_kinds.bulging_bodies)
+        bounce_lines = self._transport.notes(preview, light, materials)
+        blocker_lines = self._method.blocker_notes(view.blocker_kinds)
+        notes = [*receiver_lines, *blocker_lines, *bounce_lines, *shell_notes(self.scene.shell)]
         return Explanation(
             image, self._views.call(view), self.clock.timings, is_host=is_host, hidden=hidden, notes=notes
         )

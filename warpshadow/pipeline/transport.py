@@ -168,13 +168,13 @@ class LightTransport:
             return None
         solver = self.bounce_solver(points, light, materials)
         if solver is BounceSolver.MOVING:
-            of_patches = field_of(self._moving_bounces.radiosity(points, light, materials), "radiosity")
+            patch_radiosity = field_of(self._moving_bounces.radiosity(points, light, materials), "radiosity")
         elif solver is BounceSolver.STATIC and not light.is_free:
             at_patch_samples = self._lit_patch_samples(points, light, materials)
-            of_patches = self._static_bounces.radiosity(at_patch_samples, points, materials)
+            patch_radiosity = self._static_bounces.radiosity(at_patch_samples, points, materials)
         else:
             return None
-        return Node("", lambda radiosity: multiply(senders.mean_over_faces, radiosity), of_patches)
+        return Node("", lambda radiosity: multiply(senders.mean_over_faces, radiosity), patch_radiosity)
 
     def _openness(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node | None:
         """Part of the hemispheres of points that no blocker takes, vec3 of shape [view, receiver].

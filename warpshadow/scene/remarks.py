@@ -204,8 +204,8 @@ def blurred_shell(scene: Scene) -> list[str]:
 
     A studio with a small soft box, at a radius of 3, was 16% off, and with 512 cells in place of 128 half of that.
     """
-    light = scene.known_light
-    if scene.shell is None or not scene.visibility.traits.has_cells or not isinstance(light, EnvironmentMap):
+    light = scene.known_light.as_map
+    if scene.shell is None or not scene.visibility.traits.has_cells or light is None:
         return []
     bright = _share_of_brightest_half(light)
     if bright * scene.direction_count >= 1:
@@ -219,8 +219,8 @@ def blurred_shell(scene: Scene) -> list[str]:
 
 def sun_below(scene: Scene) -> list[str]:
     """Remark on a map half of whose light is a sun's below the horizon, over a ground that is broader than all."""
-    light = scene.known_light
-    if not isinstance(light, EnvironmentMap) or light.shell is not None or len(scene.bodies) < 2:
+    light = scene.known_light.as_map
+    if light is None or light.shell is not None or len(scene.bodies) < 2:
         return []
     grounds = grounds_of(scene)
     if not grounds:

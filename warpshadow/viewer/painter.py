@@ -15,7 +15,7 @@ from warpshadow import check
 from warpshadow.assets.camera import Camera, framed_points
 from warpshadow.assets.color import auto_exposure, linear_to_srgb
 from warpshadow.assets.known_light import as_light
-from warpshadow.assets.light import EnvironmentMap, KnownLightArgument
+from warpshadow.assets.light import KnownLightArgument
 from warpshadow.device.threads import locked
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibility
@@ -64,7 +64,7 @@ class Painter:
 
     def __init__(self, scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False):
         self.scene = scene = scene.with_method()
-        self.has_map = isinstance(scene.light, EnvironmentMap)
+        self.has_map = scene.known_light.as_map is not None
         self._device, self._progress = device, progress
         low, high = bounds(scene)
         self.page_scale = page_scale(low, high)

@@ -10,7 +10,11 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.assets.mesh import Mesh
+from warpshadow.pipeline.bodies.blockers import GroupBlockers
+from warpshadow.pipeline.receivers import groups
 from warpshadow.pipeline.renderer import SceneRenderer
+from warpshadow.stages.planes.fronts import NearestBlockers
+from warpshadow.stages.receivers.body_spans import Span
 
 CAMERA = ws.Camera.look_at((2.0, 2.6, 4.6), (0, 0.5, 0), fov_y=40, size=(24, 24))
 VISIBILITY = ws.Visibility(directions=32)
@@ -66,3 +70,20 @@ def test_points_of_no_body_get_light_from_flat_bodies():
         renderer = SceneRenderer(dataclasses.replace(scene, bounces=bounces), progress=False)
         shadings.append(renderer.shade(view=renderer.at_points(*down)).numpy())
     assert (shadings[1] > shadings[0] + 0.1).all()
+
+
+def test_portions_have_their_receivers_part_of_each_array(monkeypatch):
+    monkeypatch.setattr(groups, "RECEIVERS_AT_ONCE", 4)
+    numbers = np.arange(10, dtype=np.float32)
+    points = wp.array(np.repeat(numbers[None, :, None], 3, axis=2), dtype=wp.vec3)
+    nearest = NearestBlockers(points, wp.zeros((1, 10)), wp.array(numbers, dtype=wp.int32))
+    spans = Span(0, 0, 3), Span(1, 3, 10)
+    group = groups.Group(points, points, GroupBlockers(), points, spans, nearest_blockers=nearest)
+    portions = list(group.portions())
+    assert [portion.first for portion in portions] == [0, 3, 7]
+    assert [portion.spans for portion in portions] == [(Span(0, 0, 3),), (Span(1, 0, 4),), (Span(1, 0, 3),)]
+    for portion in portions:
+        expected = numbers[portion.first : portion.first + portion.spans[-1].end]
+        arrays = [value for value in vars(portion).values() if isinstance(value, wp.array)]
+        assert len(arrays) == 3 and all((array.numpy()[0, :, 0] == expected).all() for array in arrays)
+        assert (portion.nearest_blockers.blocker_indices.numpy() == expected).all()

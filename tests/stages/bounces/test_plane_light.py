@@ -35,31 +35,33 @@ def passing_flats(points, transmittance, frames, planes, directions, **options):
 
 
 @pytest.mark.parametrize("two_sided", [False, True])
-@pytest.mark.parametrize("skip", [None, 0])
+@pytest.mark.parametrize("self_plane", [None, 0])
 @pytest.mark.parametrize("names", [("ground",), ("l",), ("ground", "wall", "l")])
 @pytest.mark.parametrize("coverage", ["outline", "texels"])
-def test_light_is_that_of_the_formula(names, skip, two_sided, coverage, device, monkeypatch):
+def test_light_is_that_of_the_formula(names, self_plane, two_sided, coverage, device, monkeypatch):
     if coverage == "texels":
         monkeypatch.setattr(plane_blockers, "MAX_EDGES", 5)
     setting = Setting(device, names=names, two_sided=two_sided, batch=2)
     points, normals, transmittance, vertices, radiosity = setting.arrays()
     frames = setting.planes.frames(vertices)
     light = plane_light(
-        points, normals, transmittance, frames, radiosity, setting.planes, DIRECTIONS, skip=skip
+        points, normals, transmittance, frames, radiosity, setting.planes, DIRECTIONS, self_plane=self_plane
     ).numpy()
     for batch in range(2):
-        np.testing.assert_allclose(light[batch], setting.light(skip, batch), atol=FLOAT32)
+        np.testing.assert_allclose(light[batch], setting.light(self_plane, batch), atol=FLOAT32)
 
 
-@pytest.mark.parametrize("skip", [None, 0])
-def test_white_flats_send_what_they_block(skip, device):
+@pytest.mark.parametrize("self_plane", [None, 0])
+def test_white_flats_send_what_they_block(self_plane, device):
     """Where cells are divided between flats without a remainder; a tenth of the light was missing without that."""
     setting = Setting(device, two_sided=True)
     points, normals, transmittance, vertices, radiosity = setting.arrays()
     radiosity.fill_(1.0)
     frames, planes = setting.planes.frames(vertices), setting.planes
-    light = plane_light(points, normals, transmittance, frames, radiosity, planes, DIRECTIONS, skip=skip).numpy()
-    options = {"skip": skip, "horizon_normals": normals}
+    light = plane_light(
+        points, normals, transmittance, frames, radiosity, planes, DIRECTIONS, self_plane=self_plane
+    ).numpy()
+    options = {"self_plane": self_plane, "horizon_normals": normals}
     passing = passing_flats(points, transmittance, frames, planes, DIRECTIONS, **options).numpy()
     weights = 4 / len(DIRECTIONS) * np.maximum(setting.normals @ DIRECTIONS.T, 0)
     blocked = (weights * (setting.transmittance - passing)).sum(axis=2)
@@ -67,16 +69,16 @@ def test_white_flats_send_what_they_block(skip, device):
     np.testing.assert_allclose(light[..., 0], blocked, atol=FLOAT32)
 
 
-@pytest.mark.parametrize("skip", [None, 1])
+@pytest.mark.parametrize("self_plane", [None, 1])
 @pytest.mark.parametrize("coverage", ["outline", "texels"])
-def test_what_passes_is_that_of_the_formula(skip, coverage, device, monkeypatch):
+def test_what_passes_is_that_of_the_formula(self_plane, coverage, device, monkeypatch):
     if coverage == "texels":
         monkeypatch.setattr(plane_blockers, "MAX_EDGES", 5)
     setting = Setting(device, blocks=(True, False, True))
     points, _, transmittance, vertices, _ = setting.arrays()
     frames = setting.planes.frames(vertices)
-    passing = passing_flats(points, transmittance, frames, setting.planes, DIRECTIONS, skip=skip).numpy()
-    np.testing.assert_allclose(passing[0], setting.passing(skip), atol=FLOAT32)
+    passing = passing_flats(points, transmittance, frames, setting.planes, DIRECTIONS, self_plane=self_plane).numpy()
+    np.testing.assert_allclose(passing[0], setting.passing(self_plane), atol=FLOAT32)
     assert passing.min() >= 0 and np.abs(passing - setting.transmittance).max() > 0.5
 
 
@@ -369,8 +371,8 @@ def test_no_other_flat_leaves_all_as_it_is(device):
     setting = Setting(device, names=("ground",))
     points, normals, transmittance, vertices, radiosity = setting.arrays()
     frames = setting.planes.frames(vertices)
-    assert plane_coverage(points, frames, setting.planes, DIRECTIONS, skip=0) is None
-    light = plane_light(points, normals, transmittance, frames, radiosity, setting.planes, DIRECTIONS, skip=0)
+    assert plane_coverage(points, frames, setting.planes, DIRECTIONS, self_plane=0) is None
+    light = plane_light(points, normals, transmittance, frames, radiosity, setting.planes, DIRECTIONS, self_plane=0)
     assert not light.numpy().any()
 
 
@@ -382,8 +384,8 @@ def test_what_does_not_fit_is_refused(device):
         passing_flats(points, transmittance, frames, setting.planes, fibonacci(16))
     with pytest.raises(ValueError, match="frames"):
         passing_flats(points, transmittance, vertices, setting.planes, DIRECTIONS)
-    with pytest.raises(ValueError, match="skip"):
-        plane_light(points, normals, transmittance, frames, radiosity, setting.planes, DIRECTIONS, skip=1)
+    with pytest.raises(ValueError, match="self_plane"):
+        plane_light(points, normals, transmittance, frames, radiosity, setting.planes, DIRECTIONS, self_plane=1)
 
 
 def test_a_far_scale_gives_finite_light_and_gradients(device):

@@ -238,7 +238,7 @@ def test_strips_that_touch_cover_as_much_as_the_panel_they_make(device):
 def test_receivers_on_a_compound_see_its_other_parts(device):
     """On the lowest slat, in the plane of the hull's side."""
     placed, some = compound(device)
-    options = {"horizon_normals": wp.array([[(0, 1, 0)]], dtype=wp.vec3, device=device), "skips": (1,)}
+    options = {"horizon_normals": wp.array([[(0, 1, 0)]], dtype=wp.vec3, device=device), "self_bodies": (1,)}
     point = wp.array([[(0.1, -0.175, 0.03)]], dtype=wp.vec3, device=device)
     found = part_coverage(point, placed, some, DIRECTIONS, on_surface=True, **options).numpy()[0, 0, :, 0]
     above = twin(np.array([0.1, -0.175, 0.03]), DIRECTIONS, cell_radius(32), [[0]], vertices=[SLATS[1].vertices])[:, 0]
@@ -302,7 +302,7 @@ def test_narrow_cells_and_a_receivers_own_body_are_left_to_it(device):
     # beside corners, where silhouettes are
     toward = np.concatenate([VERTICES[0], VERTICES[1]])[:16] - POINTS[0] + 0.004
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    got = of_kernel(POINTS[[0]], device, toward, radius=0.02, skips=[1])[0]
+    got = of_kernel(POINTS[[0]], device, toward, radius=0.02, self_bodies=[1])[0]
     expected = twin(POINTS[0], toward, 0.02, BODIES[:1])
     assert ((expected[:, 0] > 0.1) & (expected[:, 0] < 0.9)).sum() > 4
     np.testing.assert_allclose(got, expected, rtol=0, atol=RAYS)
@@ -320,14 +320,14 @@ def test_bodies_that_cast_no_shadow_block_nothing(device):
     some = blockers(device, blocks=(True, False))
     points = wp.array(POINTS[None], dtype=wp.vec3, device=device)
     got = part_coverage(points, some.place(vertices), some, DIRECTIONS).numpy()[0]
-    np.testing.assert_array_equal(got, of_kernel(POINTS, device, skips=[1]))
+    np.testing.assert_array_equal(got, of_kernel(POINTS, device, self_bodies=[1]))
 
 
 def test_receivers_of_several_bodies_are_as_those_of_each_alone(device):
-    spans, skips = [Span(0, 0, 1), Span(-1, 1, 4), Span(1, 4, 6)], (0, -1, 1)
-    got = of_kernel(POINTS, device, body_spans=spans, skips=skips)
-    for (_, first, end), skip in zip(spans, skips, strict=True):
-        np.testing.assert_array_equal(got[first:end], of_kernel(POINTS[first:end], device, skips=[skip]))
+    spans, self_bodies = [Span(0, 0, 1), Span(-1, 1, 4), Span(1, 4, 6)], (0, -1, 1)
+    got = of_kernel(POINTS, device, body_spans=spans, self_bodies=self_bodies)
+    for (_, first, end), self_body in zip(spans, self_bodies, strict=True):
+        np.testing.assert_array_equal(got[first:end], of_kernel(POINTS[first:end], device, self_bodies=[self_body]))
 
 
 def test_nothing_below_the_horizon_is_blocked(device):
@@ -350,7 +350,7 @@ def test_instances_have_parts_of_their_own(device):
 
 
 def test_errors_name_the_argument(device):
-    with pytest.raises(ValueError, match=r"skips: got 2"):
-        of_kernel(POINTS, device, skips=[2])
+    with pytest.raises(ValueError, match=r"self_bodies: got 2"):
+        of_kernel(POINTS, device, self_bodies=[2])
     with pytest.raises(ValueError, match=r"positions: got"):
         blockers(device).place(wp.zeros((1, 3), dtype=wp.vec3, device=device))

@@ -23,16 +23,16 @@ def samples_of_cells():
     return drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
 
 
-@pytest.mark.parametrize("skip", [None, 1])
+@pytest.mark.parametrize("self_plane", [None, 1])
 @pytest.mark.parametrize("is_facing", [False, True])
 @pytest.mark.parametrize("names", [("ground", "wall"), ("l",)])
-def test_cells_that_are_covered_in_part_are_so_as_where_their_light_is(names, skip, is_facing, device):
+def test_cells_that_are_covered_in_part_are_so_as_where_their_light_is(names, self_plane, is_facing, device):
     setting = Setting(device, names=names, blocks=(True,) * len(names))
-    skip = skip if len(names) > 1 else None
+    self_plane = self_plane if len(names) > 1 else None
     points, normals, _, vertices, _ = setting.arrays()
     frames, samples = setting.planes.frames(vertices), samples_of_cells()
     assert setting.planes.has_holes == (names == ("l",))
-    options = {"horizon_normals": normals if is_facing else None, "skip": skip}
+    options = {"horizon_normals": normals if is_facing else None, "self_plane": self_plane}
     covered = plane_coverage(points, frames, setting.planes, DIRECTIONS, **options)
     found = coverage_of_light(points, covered, frames, setting.planes, DIRECTIONS, samples, **options).numpy()
     np.testing.assert_array_equal(found[..., 1:], covered.numpy()[..., 1:])
@@ -42,7 +42,7 @@ def test_cells_that_are_covered_in_part_are_so_as_where_their_light_is(names, sk
     weights = np.ones((*found.shape, 8))
     if is_facing:
         cosines = np.einsum("brc,qsc->brqs", setting.normals, samples)
-        weights = np.maximum(cosines, 0) if skip is not None else cosines > 0
+        weights = np.maximum(cosines, 0) if self_plane is not None else cosines > 0
     total = weights.sum(axis=-1)
     mean = (np.minimum(each.reshape(weights.shape), 1) * weights).sum(axis=-1) / np.where(total > 0, total, 1)
     gate = np.clip(20 * np.minimum(coverage, 1 - coverage), 0, 1) * (total > 0)

@@ -101,8 +101,8 @@ class Light(Free):
         coefficients = self.coefficients(values, context).cpu().numpy()
         light: np.ndarray | EnvironmentMap = coefficients
         if isinstance(self.basis, CellBasis):
-            light, before = self.basis.to_map(coefficients), fitted.scene.light
-            if isinstance(before, EnvironmentMap):
+            light, before = self.basis.to_map(coefficients), fitted.scene.known_light.as_map
+            if before is not None:
                 light = replace(before, radiance=light.radiance)
         fitted.scene = replace(fitted.scene, light=light)
 

@@ -8,7 +8,6 @@ import torch
 from numpy.typing import ArrayLike
 
 from warpshadow import check
-from warpshadow.assets.light import EnvironmentMap
 from warpshadow.inverse.free.base import Free, Values
 from warpshadow.inverse.world import FitContext, FittedScene, World
 from warpshadow.scene.scene import Scene
@@ -64,8 +63,9 @@ class Shell(Free):
         world.shell = self.shell(values, context)
 
     def export(self, values: Values, context: FitContext, fitted: FittedScene) -> None:
-        assert isinstance(fitted.scene.light, EnvironmentMap)
-        light = replace(fitted.scene.light, radius=float(self.shell(values, context)[3]))
+        before = fitted.scene.known_light.as_map
+        assert before is not None
+        light = replace(before, radius=float(self.shell(values, context)[3]))
         fitted.scene = replace(fitted.scene, light=light)
 
     def summary(self, fitted: FittedScene) -> Mapping[str, ArrayLike]:

@@ -69,12 +69,13 @@ class Sun(Free):
         vars(self).update(direction=tuple(direction.tolist()), irradiance=tuple(strength.tolist()))
 
     def check_scene(self, scene: Scene, view_count: int) -> None:
-        if not isinstance(scene.light, EnvironmentMap):
+        light = scene.known_light.as_map
+        if light is None:
             raise ValueError(
                 "sun: got it for light in spherical harmonics, expected a map, to which it is added: "
                 "HarmonicBasis(order).to_map(coefficients)"
             )
-        scene.light.with_sun(self.direction, self.irradiance, angular_radius=self.angular_radius)
+        light.with_sun(self.direction, self.irradiance, angular_radius=self.angular_radius)
 
     @functools.cached_property
     def basis(self) -> CellBasis:
@@ -146,8 +147,9 @@ class Sun(Free):
         degrees = float(np.degrees(radius))
         if degrees < _UNRESOLVED * self.resolution:
             degrees = min(self.angular_radius, self.resolution)
-        assert isinstance(fitted.scene.light, EnvironmentMap)
-        light = fitted.scene.light.with_sun(direction, strength, angular_radius=degrees)
+        before = fitted.scene.known_light.as_map
+        assert before is not None
+        light = before.with_sun(direction, strength, angular_radius=degrees)
         fitted.scene = replace(fitted.scene, light=light)
         fitted.sun = {"direction": direction, "irradiance": strength, "angular_radius": degrees}
 

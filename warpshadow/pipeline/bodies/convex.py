@@ -6,7 +6,7 @@ panels are chords of bent cloth, in which its receivers do not lie.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,8 +25,13 @@ class GroupConvexParts(NamedTuple):
 
     blockers: ConvexBlockers
     placed_parts: PlacedParts
-    bodies: tuple[int, ...] = ()  # that blockers number, each of which blocks none of its own receivers' light
+    bodies: tuple[int, ...] = ()  # as ``blockers`` numbers them; each blocks no light of receivers that lie on it
     on_surface: bool = False  # whether receivers lie on the parts, which are those of one body
+
+    @property
+    def placed_arrays(self) -> Mapping[str, wp.array]:
+        """Where they are."""
+        return {"parts": self.placed_parts.corners}
 
     def number_of(self, body: int) -> int:
         """The number that a body has here; −1 for none."""
@@ -49,7 +54,7 @@ class GroupConvexParts(NamedTuple):
             radius=radius,
             horizon_normals=horizon_normals,
             body_spans=spans,
-            skips=[self.number_of(span.body) for span in spans] or [-1],
+            self_bodies=[self.number_of(span.body) for span in spans] or [-1],
             on_surface=self.on_surface,
         )
 

@@ -203,16 +203,16 @@ class MergedScene:
 
         is_emitting = self.is_emitter[self.body_of_face]
         faces, uv_faces = (self._array(item.numpy()[is_emitting], wp.vec3i) for item in (self.faces, self.uv_faces))
-        of_textures = None
+        emission_textures = None
         if textures is not None:
             texture_ids = self._array(texture_of_face.numpy()[is_emitting], wp.int32)
-            of_textures = EmissionTextures(textures, texture_ids, self.uvs[0], uv_faces)
+            emission_textures = EmissionTextures(textures, texture_ids, self.uvs[0], uv_faces)
         is_two_sided = self.is_two_sided[self.body_of_face[is_emitting]]
         face_beams = None
         if axes is not None:
             emitter_ids = self.emitter_of_face[is_emitting]
             face_beams = FaceBeams(axes.numpy()[emitter_ids], self.emitter_beams[emitter_ids])
-        return emitting_faces(positions, emission, faces, is_two_sided, of_textures, face_beams)
+        return emitting_faces(positions, emission, faces, is_two_sided, emission_textures, face_beams)
 
     @functools.cached_property
     def two_sided_faces(self) -> wp.array:
@@ -444,8 +444,8 @@ class MergedScene:
         """The faces around the vertices of consecutive bodies, which have numbers from ``first`` on."""
         if (first, end) not in self._rings_of:
             faces = self.faces.numpy()
-            of_bodies = faces[(faces[:, 0] >= first) & (faces[:, 0] < end)] - first
-            self._rings_of[first, end] = OneRings.of_faces(of_bodies, end - first, device=self.device)
+            body_faces = faces[(faces[:, 0] >= first) & (faces[:, 0] < end)] - first
+            self._rings_of[first, end] = OneRings.of_faces(body_faces, end - first, device=self.device)
         return self._rings_of[first, end]
 
     @functools.cached_property

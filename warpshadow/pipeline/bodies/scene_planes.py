@@ -5,14 +5,17 @@ Instead, the share of a cell of directions that a plane covers is computed.
 """
 
 import functools
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
+from warpshadow.device.constants import IdentityKey
 from warpshadow.maths.directions import fibonacci
 from warpshadow.maths.plane import principal_axes
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
+from warpshadow.stages.planes.fronts import find_body_sides
 from warpshadow.stages.planes.grid import find_grid
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
 from warpshadow.stages.sparse import SparseMatrix, multiply
@@ -26,12 +29,12 @@ class GroupPlanes(NamedTuple):
 
     blockers: PlaneBlockers
     frames: wp.array  # where they are, vec3 of shape [batch, 3 · plane]
-    skip: int | None = None  # the one that the receivers are part of
+    self_plane: int | None = None  # the one that the receivers are part of
 
     @property
-    def blocking(self) -> set[int]:
-        """Numbers of the planes that block the receivers' light."""
-        return set(self.blockers.is_blocking) - {self.skip}
+    def placed_arrays(self) -> Mapping[str, wp.array]:
+        """Where they are."""
+        return {"planes": self.frames}
 
 
 class ScenePlanes:
@@ -135,3 +138,32 @@ class ScenePlanes:
             first_vertex = int(self._merged_scene.first_vertex[number])
             self._bodies[number] = PlaneBody(grid, *surface, first_vertex, 0, blocks=True)
         return self._bodies[number]
+
+
+class BodySides:
+    """On which side of planes each body lies, by its farthest vertices; found once for all groups.
+
+    Args:
+        planes: Of the scene.
+        positions: Vertices of all bodies, vec3 of shape [batch, vertex].
+    """
+
+    def __init__(self, planes: ScenePlanes, positions: wp.array):
+        self._planes, self._positions = planes, positions
+        self._is_captured = positions.device.is_capturing
+        self._sides: dict[IdentityKey, wp.array] = {}
+
+    @property
+    def placed_arrays(self) -> Mapping[str, wp.array]:
+        """Where the bodies are."""
+        return {"positions": self._positions}
+
+    def sides_of(self, frames: wp.array, planes: PlaneBlockers) -> wp.array:
+        """The side of each plane on which each body lies, [batch, body, plane], found once for all receivers."""
+        if (key := IdentityKey(frames)) in self._sides:
+            return self._sides[key]
+        corners, first_corner = self._planes.corners(self._positions), self._planes.first_corner
+        sides = find_body_sides(corners, first_corner, frames, planes)
+        if frames.device.is_capturing == self._is_captured:  # what a graph makes, only its replays fill
+            self._sides[key] = sides
+        return sides

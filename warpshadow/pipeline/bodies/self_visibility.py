@@ -30,7 +30,7 @@ from warpshadow.spheres.normalized_mesh import normalize
 from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.rays.ray_packets import FaceTree, build_face_tree
-from warpshadow.stages.receivers.body_spans import Span, relative_spans
+from warpshadow.stages.receivers.body_spans import Span
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.self_visibility.buried import find_buried, find_dilation
 from warpshadow.stages.self_visibility.gather import BodyTables, gather_self_transmittance
@@ -85,9 +85,14 @@ class SelfVisibilityLookup(NamedTuple):
     rays: tuple[RayProbes, wp.array] | None = None  # for a sun, and the rotations; None where it is looked up, too
 
     @property
-    def turned(self) -> wp.array:
-        """The part that depends on the rotations, of shape [batch, …]."""
-        return self.weights.weights
+    def placed_arrays(self) -> Mapping[str, wp.array]:
+        """The part that depends on the rotations."""
+        return {"rotations": self.weights.weights}
+
+    @property
+    def is_of_one_body(self) -> bool:
+        """Whether it serves the receivers of one body alone."""
+        return self.rays is not None
 
     def transmittance(self, normals: wp.array, weights: ProbeWeights, spans: tuple[Span, ...]) -> wp.array:
         """Transmittance of receivers in spans past their bodies, [batch, receiver, cell]."""
@@ -105,9 +110,14 @@ class SelfVisibilityLobes(NamedTuple):
     turn: BodyRotation
 
     @property
-    def turned(self) -> wp.array:
-        """The part that depends on the rotations, of shape [batch, …]."""
-        return self.turn.rotations
+    def placed_arrays(self) -> Mapping[str, wp.array]:
+        """The part that depends on the rotations."""
+        return {"rotations": self.turn.rotations}
+
+    @property
+    def is_of_one_body(self) -> bool:
+        """True: lobes are turned by the rotation of their body."""
+        return True
 
     def of_receivers(self, weights: ProbeWeights, *, order: int, bands: int | None = None) -> wp.array:
         """Lobes that their body leaves receivers, [batch, receiver, bands²]; by default all bands of an order."""
@@ -196,17 +206,18 @@ class SelfVisibility:
             cached[key] = find()
         return cached[key]
 
-    def probe_weights(self, receivers: Receivers, spans: tuple[Span, ...]) -> ProbeWeights:
+    def probe_weights(self, receivers: Receivers, first: int, spans: tuple[Span, ...]) -> ProbeWeights:
         """Where receivers lie among the probes of their bodies. Differentiable: barycentrics of samples.
 
         Args:
             receivers: All of them.
-            spans: Some that follow each other, all at vertices or all at samples.
+            first: The first of those asked for.
+            spans: These, counted from there, all at vertices or all at samples.
         """
         assert receivers.vertices is not None
         bodies = tuple(dict.fromkeys(span.body for span in spans))
-        first, end, vertex_count = spans[0].first, spans[-1].end, receivers.vertices.size
-        places = relative_spans(spans), [bodies.index(span.body) for span in spans]
+        end, vertex_count = first + spans[-1].end, receivers.vertices.size
+        places = spans, [bodies.index(span.body) for span in spans]
         if first < vertex_count:
             return self._tables_of(bodies).of_vertices(receivers.vertices[first:end], *places)
         fragments, first, end = receivers.sample_fragments, first - vertex_count, end - vertex_count

@@ -10,7 +10,8 @@ import warp as wp
 
 from warpshadow.device.batch import common_batch, expand
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.receivers.groups import CellVisibility, Group, HarmonicVisibility
+from warpshadow.pipeline.receivers.groups import Group
+from warpshadow.pipeline.shading.found_visibility import CellVisibility, HarmonicVisibility
 from warpshadow.pipeline.shading.sphere_method import SphereMethod
 from warpshadow.stages.visibility.directional import transmittance
 
@@ -53,10 +54,8 @@ def find_cell_transmittance(
     else:
         directions, transmittance_self = HARMONIC_GATHER_CELLS, None
         transmittance_nonplanar = _transmittance(method, group, merged_scene.nonplanar_bodies, spheres, directions)
-    bodies = group.receiver_bodies
-    if transmittance_self is None and bodies is not None and not bodies.is_solid:
-        nonplanar = [span.body for span in group.spans if not merged_scene.is_flat[span.body]]
-        transmittance_self = _transmittance(method, group, nonplanar, spheres, directions)
+    if transmittance_self is None and group.body is not None and not merged_scene.is_flat[group.body]:
+        transmittance_self = _transmittance(method, group, [group.body], spheres, directions)
     if transmittance_nonplanar is None:
         transmittance_nonplanar = wp.full(
             (*group.points.shape, len(directions)), 1.0, wp.float32, device=group.points.device

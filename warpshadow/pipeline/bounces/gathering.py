@@ -150,28 +150,28 @@ class BounceGatherer:
     def _from_itself(
         self, group: Group, _: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array
     ) -> wp.array:
-        bodies, spans = group.receiver_bodies, group.spans
-        first_probes = outgoing.probe_form_factors.first_of(spans)
-        if bodies is None or max(first_probes) < 0:  # convex bodies send themselves nothing
+        first_probes = outgoing.probe_form_factors.first_of(group.spans)
+        if max(first_probes, default=-1) < 0:  # convex bodies send themselves nothing
             return others
-        probes = bodies.probe_weights
-        return self_light(outgoing.probe_light, *probes, others, body_spans=spans, first_probes=first_probes)
+        arguments = outgoing.probe_light, *group.probe_weights, others
+        return self_light(*arguments, body_spans=group.spans, first_probes=first_probes)
 
     def _from_planes(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array
     ) -> wp.array:
         planes = outgoing.proxies.planes
         assert planes is not None
-        skip = planes.index_of_body.get(group.spans[0].body) if group.spans else None
-        if planes.blockers.count == (skip is not None):
+        self_plane = None if group.body is None else planes.index_of_body.get(group.body)
+        if planes.blockers.count == (self_plane is not None):
             return others
-        fronts = group.find_fronts(outgoing.frames, planes.blockers, skip)
+        fronts = group.find_fronts(outgoing.frames, planes.blockers, self_plane)
         # Planes are seen through the middles of cells. Through transmittance.directions, where skylight comes from,
         # which are above horizons, a ball on a ground lost 4% of the ground's light.
         middles = fibonacci(len(transmittance.directions))
         arguments = fronts.lifted_points, group.normals, transmittance.transmittance_nonplanar, outgoing.frames
-        options = {"coverages": transmittance.part_coverages, "front_weights": fronts.front_weights, "skip": skip}
-        return plane_light(*arguments, outgoing.texels, planes.blockers, middles, **options, addend=others)
+        options = {"front_weights": fronts.front_weights, "self_plane": self_plane, "addend": others}
+        coverages = transmittance.part_coverages
+        return plane_light(*arguments, outgoing.texels, planes.blockers, middles, **options, coverages=coverages)
 
     def _from_spheres(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array
@@ -181,7 +181,7 @@ class BounceGatherer:
             return others
         proxies, proxy_radiance = outgoing.placed_proxies, outgoing.proxy_radiance
         softness = self._visibility.softness
-        if group.convex_parts_around is not None:
+        if group.blockers.convex_parts is not None:
             softness = max(softness, _SOFTNESS_OF_PARTS)
         geometry = {"geometry": group.points, "proxies": proxies.radii}
         count = common_batch({**geometry, "light": proxy_radiance, "other light": others})
@@ -196,7 +196,7 @@ class BounceGatherer:
             softness=softness,
             merging=self._visibility.merging,
             body_spans=group.spans,
-            skips=[outgoing.proxies.span_of(span.body) for span in group.spans],
+            skips=[outgoing.proxies.range_of(span.body) for span in group.spans],
             clusters=proxies.clusters if is_same else None,
             tangent_planes=proxies.tangent_planes,
             addend=others,

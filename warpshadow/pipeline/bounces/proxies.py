@@ -87,7 +87,7 @@ class Proxies:
             return None
         return SparseMatrix.from_matrix(overlays.before, device=self.merged_scene.device), overlays.distances
 
-    def span_of(self, body: int | None) -> tuple[int, int]:
+    def range_of(self, body: int | None) -> tuple[int, int]:
         """Where the proxies of a body begin and end."""
         first = self.senders.first
         if body in self.senders.bodies:
@@ -130,15 +130,15 @@ class Proxies:
         numbers, ratios = np.full(len(senders.areas), -1, np.int32), np.zeros(len(senders.areas), np.float32)
         start = 0
         for body in self.merged_scene.nonplanar_bodies:
-            of_body = slice(*first_sphere[body : body + 2])
-            if len(radii[of_body]) and body in senders.bodies:
+            sphere_range = slice(*first_sphere[body : body + 2])
+            if len(radii[sphere_range]) and body in senders.bodies:
                 sender_index = senders.bodies.index(body)
                 patches = senders.patches[sender_index]
                 patch_range = slice(*senders.first[sender_index : sender_index + 2])
-                nearest = patches.nearest_spheres(centers[of_body], radii[of_body])
+                nearest = patches.nearest_spheres(centers[sphere_range], radii[sphere_range])
                 numbers[patch_range] = start + nearest
-                ratios[patch_range] = np.sqrt(patches.areas / 2) / np.maximum(radii[of_body][nearest], 1e-30)
-            start += len(radii[of_body])
+                ratios[patch_range] = np.sqrt(patches.areas / 2) / np.maximum(radii[sphere_range][nearest], 1e-30)
+            start += len(radii[sphere_range])
         return numbers, ratios
 
     @functools.cached_property
@@ -175,8 +175,8 @@ class Proxies:
         centers, radii = self.merged_scene.spheres_of(self.merged_scene.nonplanar_bodies, spheres)
         if planes is not None:
             numbers, points, device = self.nearest_spheres, patch_samples.points, normals.device
-            of_patch_samples = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
-            front_weights = find_fronts(points, normals, None, of_patch_samples, frames, planes.blockers).front_weights
+            nearest_blockers = NearestBlockers(centers, radii, constant(numbers, wp.int32, device))
+            front_weights = find_fronts(points, normals, None, nearest_blockers, frames, planes.blockers).front_weights
             if self.overlays is not None:
                 numbers = np.where(self.overlays[1][senders.patch_of_sample] > 0, np.int32(-1), numbers)
             normals = tilt_normals_off_planes(points, normals, radii, numbers, front_weights, frames, planes.blockers)
@@ -190,8 +190,8 @@ class Proxies:
             proxies = tuple(concatenate(pair, counts) for pair in zip(proxies, others, strict=True))
         areas = find_projected_areas(normals, transmittance, self._mean_of_seen, directions)
         clusters = find_clusters(*proxies, self.merging)
-        of_clusters = clusters.nodes.centers, *self.patches_of_clusters, self._tolerances
-        tangent_planes = find_tangent_planes(mean_points, mean_normals, *of_clusters)
+        cluster_inputs = clusters.nodes.centers, *self.patches_of_clusters, self._tolerances
+        tangent_planes = find_tangent_planes(mean_points, mean_normals, *cluster_inputs)
         return PlacedProxies(areas, *proxies, clusters, tangent_planes)
 
 

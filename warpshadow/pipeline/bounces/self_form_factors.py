@@ -96,9 +96,9 @@ class SelfFormFactors:
 
         factors, spans = self.of_senders(senders), group.spans
         first_probes = np.repeat(factors.first_of(spans), [span.end - span.first for span in spans])
-        if group.receiver_bodies is None or not (first_probes >= 0).any():
+        if not (first_probes >= 0).any():
             return csr_matrix((group.points.shape[1], len(senders.areas)), dtype=np.float32)
-        probes, weights = (item.numpy()[0] for item in group.receiver_bodies.probe_weights)
+        probes, weights = (item.numpy()[0] for item in group.probe_weights)
         sends = first_probes[:, None] >= 0
         entries = np.where(sends, weights, 0), np.where(sends, probes + first_probes[:, None], 0)
         starts, shape = np.arange(0, probes.size + 1, 3), (len(probes), factors.matrix.shape[0])

@@ -112,16 +112,16 @@ def find_form_factors(
     rays_to_patches = _RaysToPatches(senders, mesh, build_loose_tree(mesh), patch_of_sides, bright, rays, progress)
 
     sky = None if sky_at_patch_samples is None else sky_at_patch_samples.numpy()[0, :, 0]
-    of_patch_samples = rays_to_patches.trace(patch_samples.points.numpy()[0], patch_samples.normals.numpy()[0], sky)
-    means, is_buried = senders.mean.to_scipy(), of_patch_samples.is_buried
+    sample_form_factors = rays_to_patches.trace(patch_samples.points.numpy()[0], patch_samples.normals.numpy()[0], sky)
+    means, is_buried = senders.mean.to_scipy(), sample_form_factors.is_buried
     mean = mean_outside(means, is_buried)[senders.nearest_open_patches(means @ ~is_buried > 0)]
-    within_bodies, between_bodies = _split_by_bodies(mean @ of_patch_samples.factors, senders.body_of_patch)
+    within_bodies, between_bodies = _split_by_bodies(mean @ sample_form_factors.factors, senders.body_of_patch)
 
     points, normals = _ray_origins(receivers, positions, senders), receivers.normals.numpy()
     shape, device = points.shape[:2], positions.device
     skies = None if sky_at_receivers is None else np.broadcast_to(sky_at_receivers.numpy()[..., 0], shape)
-    of_views = map(rays_to_patches.trace_some, points, normals, [None] * shape[0] if skies is None else skies)
-    receiver_weights, to_cache_points, openness = zip(*of_views, strict=True)
+    traced_views = map(rays_to_patches.trace_some, points, normals, [None] * shape[0] if skies is None else skies)
+    receiver_weights, to_cache_points, openness = zip(*traced_views, strict=True)
     sparse = functools.partial(SparseMatrix.from_matrix, device=device)
     return StaticFormFactors(
         sparse(mean),
@@ -195,10 +195,10 @@ def _ray_origins(receivers: Receivers, positions: wp.array, senders: Senders) ->
     points, vertices = receivers.points.numpy().copy(), positions.numpy()[0]
     if receivers.receiver_of_vertex is None:  # of points that are given
         return points
-    of_sides = receivers.receiver_of_vertex.numpy()
-    sides = np.flatnonzero(of_sides >= 0)
+    receiver_of_side = receivers.receiver_of_vertex.numpy()
+    sides = np.flatnonzero(receiver_of_side >= 0)
     origins = inset_vertices(vertices, senders.merged_scene.faces.numpy())
-    points[:, of_sides[sides]] = origins[sides % len(vertices)]
+    points[:, receiver_of_side[sides]] = origins[sides % len(vertices)]
     return points
 
 

@@ -71,14 +71,16 @@ class CellLobes(LobeVisibility):
     ) -> wp.array:
         if not diffuse.size:
             return diffuse
-        of_cells = transfer = directional_transfer(transmittance, receivers.normals, projected_light.cosine_directions)
+        cell_transfer = transfer = directional_transfer(
+            transmittance, receivers.normals, projected_light.cosine_directions
+        )
         if projected_light.shell_cells is not None:
             arguments = receivers.points, receivers.normals, transmittance, projected_light.blocking_directions
             transfer = projected_light.shell_cells.transfer(*arguments)
         light = projected_light.coefficients if free is None else change_basis(free, self._method.native_from_basis)
         assert light is not None
         even = wp.full((1, transmittance.shape[2]), wp.vec3(1.0), dtype=wp.vec3, device=diffuse.device)
-        direct, openness = shade(transfer, light, maximum=LARGEST_COEFFICIENT), shade(of_cells, even)
+        direct, openness = shade(transfer, light, maximum=LARGEST_COEFFICIENT), shade(cell_transfer, even)
         return find_blocked_radiance(diffuse, direct, openness)
 
 

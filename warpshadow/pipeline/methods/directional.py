@@ -12,15 +12,17 @@ from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.memory import empty, from_numpy
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import cell_radius, fibonacci
+from warpshadow.pipeline.bodies.blockers import BlockerKinds, GroupSpheres
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.methods.cell_lobes import CellLobes
 from warpshadow.pipeline.methods.glossy_cells import shading_with_cells
 from warpshadow.pipeline.methods.sharpest_cells import SharpestCells, find_share_of_sharpest_light, find_sharpest_cells
 from warpshadow.pipeline.node import Input, Node, field_of
-from warpshadow.pipeline.receivers.groups import CellCoverages, CellVisibility, Group
-from warpshadow.pipeline.receivers.shading_context import BlockerKinds, ShadingContext
+from warpshadow.pipeline.receivers.groups import Group
+from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
+from warpshadow.pipeline.shading.found_visibility import CellCoverages, CellVisibility
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells, project_on_cells
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
@@ -96,30 +98,29 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def find_visibility(self, group: Group, projected_light: ProjectedCells) -> CellVisibility:
         """Transmittance of a group past its own body, spheres and convex parts."""
-        points, normals, radii, cached_rows = group.points, group.normals, group.radii, group.cached_rows
         directions = projected_light.blocking_directions
+        spheres, planes, convex_parts, _self_parts, _self_lookup, _body_sides = group.blockers
         transmittance_self = self._transmittance_self(group, projected_light)
         # cached cells have light although their middles are below the horizon
-        horizon_normals = normals if cached_rows is None else None
+        horizon_normals = group.normals if group.cached_rows is None else None
         past_spheres, parts = transmittance_self, None
-        if points.size and radii.shape[1]:
-            of_spheres = self._past_spheres(group, horizon_normals, projected_light)
-            past_spheres = of_spheres if past_spheres is None else multiply_transmittances(past_spheres, of_spheres)
-        if points.size and group.convex_parts_around is not None:
+        if spheres is not None:
+            factor = self._past_spheres(group, spheres, horizon_normals, projected_light)
+            past_spheres = factor if past_spheres is None else multiply_transmittances(past_spheres, factor)
+        if convex_parts is not None:
             cover = functools.partial(group.coverage_around, horizon_normals)
             parts = self._coverages(cover, projected_light)
+        visibility = CellVisibility(
+            directions, None, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
+        )
         # planes multiply their share in later; only bounces need the product without them, too
-        if group.is_blocked_by_planes and not self.merged_scene.scene.bounces:
-            return CellVisibility(
-                directions, None, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
-            )
+        if planes is not None and not self.merged_scene.scene.bounces:
+            return visibility
         total = past_spheres if parts is None else self._past_coverages(past_spheres, parts, None, projected_light)
         if total is None:
-            total = empty((*points.shape, len(directions)), dtype=wp.float32, device=points.device)
+            total = empty((*group.points.shape, len(directions)), dtype=wp.float32, device=group.points.device)
             total.fill_(1.0)
-        return CellVisibility(
-            directions, total, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
-        )
+        return visibility._replace(transmittance_total=total)
 
     def _coverages(self, cover: Callable[..., wp.array], projected_light: ProjectedCells) -> CellCoverages:
         """Coverage of all cells and of sharp ones."""
@@ -137,13 +138,13 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         projected_light: ProjectedCells,
     ) -> wp.array:
         """Transmittance past blockers that cover cells, and others that may cover the same parts of them."""
-        of_others = (None, None) if others is None else others
+        other_coverages = (None, None) if others is None else others
         sharp_cells = projected_light.sharp_cells_past_planes
         if sharp_cells is None or coverages.sharp_cells is None:
-            return transmittance_past(transmittance, coverages.all_cells, of_others[0])
+            return transmittance_past(transmittance, coverages.all_cells, other_coverages[0])
         blended = blend_sharp_cells(
-            transmittance_past(None, coverages.all_cells, of_others[0]),
-            transmittance_past(None, coverages.sharp_cells, of_others[1]),
+            transmittance_past(None, coverages.all_cells, other_coverages[0]),
+            transmittance_past(None, coverages.sharp_cells, other_coverages[1]),
             sharp_cells.slots,
             projected_light.spot_shares,
         )
@@ -155,11 +156,15 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         return softness * sharp_cells.scale * cell_radius(len(sharp_cells.directions)) / RADII_PER_HALF_ANGLE
 
     def _past_spheres(
-        self, group: Group, horizon_normals: wp.array | None, projected_light: ProjectedCells
+        self, group: Group, spheres: GroupSpheres, horizon_normals: wp.array | None, projected_light: ProjectedCells
     ) -> wp.array:
-        arguments, scales = (group.points, horizon_normals, group.centers, group.radii), self._scales
+        arguments, scales = (group.points, horizon_normals, spheres.centers, spheres.radii), self._scales
         block = functools.partial(
-            directional.transmittance, *arguments, body_spans=group.spans, skips=group.skips, clusters=group.clusters
+            directional.transmittance,
+            *arguments,
+            body_spans=group.spans,
+            skips=spheres.skips(group.spans),
+            clusters=spheres.clusters,
         )
         transmittance = block(projected_light.blocking_directions, **scales(1.0))
         if projected_light.sharp_cells is None:
@@ -189,15 +194,14 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         self, group: Group, visibility: CellVisibility, projected_light: ProjectedCells
     ) -> CellVisibility:
         """Transmittance past the flat bodies around a group, too."""
-        planes = group.planes
-        if planes is None or not group.is_blocked_by_planes:
-            return visibility
+        planes = group.blockers.planes
+        assert planes is not None
         horizon_normals = group.normals if group.cached_rows is None else None
         front_weights, points = group.fronts_of_planes
         options: dict[str, Any] = {
             "horizon_normals": horizon_normals,
             "front_weights": front_weights,
-            "skip": planes.skip,
+            "self_plane": planes.self_plane,
         }
         covered = self._coverages(
             functools.partial(plane_coverage, points, planes.frames, planes.blockers, **options), projected_light
@@ -216,22 +220,21 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def _transmittance_self(self, group: Group, projected_light: ProjectedCells) -> wp.array | None:
         """Transmittance past the body of the receivers: by its parts, or looked up, and by rays where asked."""
-        if group.self_blocking_parts is not None:
+        if group.blockers.self_parts is not None:
             coverages = self._coverages(group.self_coverage, projected_light)
             return self._past_coverages(None, coverages, None, projected_light)
-        transmittance_self, bodies = group.looked_up_transmittance(), group.receiver_bodies
-        if transmittance_self is None or bodies is None or not isinstance(bodies.lookup, SelfVisibilityLookup):
-            return None
-        rays = bodies.lookup.rays
-        if rays is None or projected_light.sun is None:
+        transmittance_self, lookup = group.looked_up_transmittance(), group.blockers.self_lookup
+        rays = lookup.rays if isinstance(lookup, SelfVisibilityLookup) else None
+        if transmittance_self is None or rays is None or projected_light.sun is None:
             return transmittance_self
         if transmittance_self.requires_grad:
             raise ValueError(
                 'self_shadows: got "rays" where a pose or a camera has a gradient, which rays under a sun do not '
                 'have, expected "traced" or "spheres"'
             )
-        of_sun = trace_sun_cells(rays[0], bodies.probe_weights, rays[1], bodies.number, projected_light.sun)
-        return blend_sharp_cells(transmittance_self, of_sun, projected_light.sun.slots)
+        assert group.body is not None
+        sun_transmittance = trace_sun_cells(rays[0], group.probe_weights, rays[1], group.body, projected_light.sun)
+        return blend_sharp_cells(transmittance_self, sun_transmittance, projected_light.sun.slots)
 
     def transfer(self, visibility: CellVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Transfer vectors; the transmittance as it is where cached cells hold known light."""
@@ -303,9 +306,9 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         points, normals = static_bodies.gathered(vertices, normals)
         numbers = split_sides(vertices, len(static_bodies.has_vertex))[0]
         arrays = from_numpy(static_bodies.ray_origins[numbers], dtype=wp.vec3, device=points.device), normals[0]
-        of_points = wp.array(numbers, dtype=wp.int32, device=points.device)
+        vertex_numbers = wp.array(numbers, dtype=wp.int32, device=points.device)
         samples = self._lit_samples if is_scene_light else self._even_samples
-        return trace_cells(static_bodies.mesh, *arrays, of_points, samples, progress=self.progress)
+        return trace_cells(static_bodies.mesh, *arrays, vertex_numbers, samples, progress=self.progress)
 
     @functools.cached_property
     def _lit_samples(self) -> CellSamples:

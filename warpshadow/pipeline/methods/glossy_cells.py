@@ -8,8 +8,8 @@ from typing import NamedTuple
 import warp as wp
 
 from warpshadow.pipeline.node import Node
-from warpshadow.pipeline.receivers.groups import CellVisibility
 from warpshadow.pipeline.receivers.shading_context import ShadingContext
+from warpshadow.pipeline.shading.found_visibility import CellVisibility
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells
 from warpshadow.pipeline.shading.sphere_method import LitPortion, ShadingNode, SphereMethod, VisibilityNode
@@ -20,9 +20,9 @@ CellMethod = SphereMethod[ProjectedCells, CellVisibility]
 
 def shading_with_cells(method: CellMethod, points: ShadingContext, light: LightInput) -> Node:
     """Node of the :class:`ShadingAndTransmittance` of points in known light that does not bounce."""
-    find, join = functools.partial(_shading_and_cells, method), functools.partial(_join_both, method)
-    arguments = method, points, method.projected_light(points, light), light
-    make = functools.partial(ShadingNode, *arguments, result_of=find, join=join)
+    join, projected_light = functools.partial(_join_both, method), method.projected_light(points, light)
+    arguments = method, points, projected_light, light
+    make = functools.partial(ShadingNode, *arguments, result_of=_shading_and_cells, join=join)
     return method.cached_for_light("direct with cells", points, light, make)
 
 
@@ -41,10 +41,9 @@ class ShadingAndTransmittance(NamedTuple):
     transmittance: wp.array  # of receivers on bodies that shine, float32 of shape [batch, receiver, direction]
 
 
-def _shading_and_cells(method: CellMethod, portion: LitPortion) -> tuple[wp.array, wp.array | None]:
+def _shading_and_cells(portion: LitPortion) -> tuple[wp.array, wp.array | None]:
     """Shading of a portion, and the transmittance of its cells if its bodies shine."""
-    is_glossy = any(method.merged_scene.is_glossy[span.body] for span in portion.group.spans)
-    return portion.result, _transmittance_of(portion) if is_glossy else None
+    return portion.result, _transmittance_of(portion) if portion.group.is_glossy else None
 
 
 def _join_both(method: CellMethod, portions: list[tuple[wp.array, wp.array | None]]) -> ShadingAndTransmittance:

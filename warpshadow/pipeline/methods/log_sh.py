@@ -11,12 +11,13 @@ from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.batch import expand_rows
 from warpshadow.device.constants import constant
 from warpshadow.device.memory import zeros
+from warpshadow.pipeline.bodies.blockers import BlockerKinds
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLobes
 from warpshadow.pipeline.node import Input
-from warpshadow.pipeline.receivers.groups import Group, HarmonicVisibility
-from warpshadow.pipeline.receivers.shading_context import BlockerKinds
+from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
+from warpshadow.pipeline.shading.found_visibility import HarmonicVisibility
 from warpshadow.pipeline.shading.shell_cells import ShellCells
 from warpshadow.pipeline.shading.sphere_method import SphereMethod
 from warpshadow.stages.light.cached_cells import add_rows
@@ -69,12 +70,12 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
 
     def find_visibility(self, group: Group, projected_light: ProjectedBands) -> HarmonicVisibility:
         """Visibility, float32 of shape [batch, receiver, order²]; None where nothing blocks."""
-        points, radii, cached_rows = group.points, group.radii, group.cached_rows
-        if not points.size or (cached_rows is None and not radii.shape[1]):
+        points, spheres, cached_rows = group.points, group.blockers.spheres, group.cached_rows
+        if cached_rows is None and spheres is None:
             return HarmonicVisibility(None)
-        if radii.shape[1]:
-            arguments = points, group.normals, group.centers, radii
-            log = self._logs(*arguments, body_spans=group.spans, skips=group.skips, clusters=group.clusters)
+        if spheres is not None:
+            arguments, spans = (points, group.normals, spheres.centers, spheres.radii), group.spans
+            log = self._logs(*arguments, body_spans=spans, skips=spheres.skips(spans), clusters=spheres.clusters)
         else:
             log = zeros((*points.shape, self._order**2), dtype=wp.float32, device=points.device)
         if cached_rows is not None:
@@ -104,11 +105,11 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
             lobes = zeros(visibility.coefficients.shape, dtype=wp.float32, device=visibility.coefficients.device)
             add_rows(group.cached_rows, lobes, channel=1)
             return lobes
-        bodies = group.receiver_bodies
-        if bodies is None or not isinstance(bodies.lookup, SelfVisibilityLobes) or not group.points.size:
+        lookup = group.blockers.self_lookup
+        if not isinstance(lookup, SelfVisibilityLobes):
             return None
         bands = projected_light.bands if visibility.coefficients is None else self._order
-        return bodies.lookup.of_receivers(bodies.probe_weights, order=self._order, bands=bands)
+        return lookup.of_receivers(group.probe_weights, order=self._order, bands=bands)
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """The log-visibility of the static spheres, for any light, [row, 1, order²]; and lobes, if one has its own."""
@@ -133,16 +134,16 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
         self_visibility = self.scene_blockers.self_visibility
         turned = self_visibility.turned_lobes(traced_bodies, static_bodies.rotations, self._order)
         for body in np.unique(bodies).tolist():
-            of_body = np.flatnonzero(bodies == body)
-            arguments = static_bodies.gathered(vertices[of_body], normals)
+            chosen_rows = np.flatnonzero(bodies == body)
+            arguments = static_bodies.gathered(vertices[chosen_rows], normals)
             others = [other for other in static_bodies.bodies if not (other == body and body in traced)]
-            rows[of_body, 0] = self._logs(*arguments, *static_bodies.spheres_of(others)).numpy()[0]
+            rows[chosen_rows, 0] = self._logs(*arguments, *static_bodies.spheres_of(others)).numpy()[0]
             if body in turned:
-                weights = self_visibility.probe_weights_of(body, vertices[of_body])
+                weights = self_visibility.probe_weights_of(body, vertices[chosen_rows])
                 result = turned[body].of_receivers(weights, order=self._order)
             else:
                 result = sh_transfer(None, arguments[1], order=self._order)
-            rows[of_body, 1] = result.numpy()[0]
+            rows[chosen_rows, 1] = result.numpy()[0]
         return wp.array(rows, dtype=wp.float32, device=device)
 
     def _logs(

@@ -10,7 +10,8 @@ from warpshadow.assets.known_light import KnownLight
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.methods.log_sh import LogSH, ProjectedBands
 from warpshadow.pipeline.node import Input
-from warpshadow.pipeline.receivers.groups import Group, HarmonicVisibility
+from warpshadow.pipeline.receivers.groups import Group
+from warpshadow.pipeline.shading.found_visibility import HarmonicVisibility
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
 from warpshadow.pipeline.shading.shell_cells import SHELL_BASIS, ShellCells, project_on_shell
 

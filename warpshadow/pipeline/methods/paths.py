@@ -85,19 +85,21 @@ def path_traced(
         drawn = sample_map(known_light.radiance, _LIGHT_SAMPLES, seed=1)
         bounced = empty((count, *shading.shape[1:]), dtype=wp.vec3, device=shading.device)
 
-        def of_instance(array: wp.array) -> wp.array:
+        def instance_rows(array: wp.array) -> wp.array:
             return instance_of(array, instance)
 
         def textures_of_instance(textures: Textures | None) -> Textures | None:
-            return None if textures is None else replace(textures, texels=of_instance(textures.texels).reshape((1, -1)))
+            return (
+                None if textures is None else replace(textures, texels=instance_rows(textures.texels).reshape((1, -1)))
+            )
 
         for instance in range(count):
             surfaces = PathSurfaces(
-                _whole_mesh(merged_scene, of_instance(casting), of_instance(positions)),
-                of_instance(casting),
+                _whole_mesh(merged_scene, instance_rows(casting), instance_rows(positions)),
+                instance_rows(casting),
                 merged_scene.faces,
-                of_instance(normals),
-                of_instance(vertex_albedo),
+                instance_rows(normals),
+                instance_rows(vertex_albedo),
                 textures_of_instance(textures),
                 colors.texture_of_face,
                 merged_scene.uvs[0],
@@ -105,15 +107,15 @@ def path_traced(
                 None
                 if emission is None or emission_images is None
                 else merged_scene.emitting_faces(
-                    of_instance(positions),
-                    of_instance(emission),
+                    instance_rows(positions),
+                    instance_rows(emission),
                     textures_of_instance(emission_textures),
                     emission_images.texture_of_face,
-                    None if axes is None else of_instance(axes),
+                    None if axes is None else instance_rows(axes),
                 ),
             )
-            places = of_instance(receivers.points), of_instance(receivers.normals)
-            options = {"bounces": bounces, "paths": paths, "shell": of_instance(shells), "progress": progress}
+            places = instance_rows(receivers.points), instance_rows(receivers.normals)
+            options = {"bounces": bounces, "paths": paths, "shell": instance_rows(shells), "progress": progress}
             light = trace_bounces(surfaces, *places, drawn, **options)
             wp.copy(bounced[instance], light)
         return add_light(shading, bounced)

@@ -74,24 +74,25 @@ def find_share_of_sharpest_light(
         Shape [batch, receiver]; None where nothing blocks.
     """
     directions, light, _, has_footprints, edge_radius, power = sharpest
-    points, normals, centers, radii = group.points, group.normals, group.centers, group.radii
-    if not radii.shape[1] and group.planes is None and group.convex_parts_around is None:
+    points, normals = group.points, group.normals
+    spheres, planes, parts, _self_parts, _self_lookup, _body_sides = group.blockers  # none is of a flat body itself
+    if spheres is None and planes is None and parts is None:
         return None
-    if radii.shape[1]:
+    if spheres is not None:
         footprints = group.footprints if has_footprints else None
         options: dict[str, Any] = {"softness": softness, "merging": merging, "footprints": footprints}
-        transmittance = directional.transmittance(points, normals, centers, radii, directions, **options)
+        arguments = points, normals, spheres.centers, spheres.radii, directions
+        transmittance = directional.transmittance(*arguments, **options)
     else:
         transmittance = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
     coverages = []
-    if group.convex_parts_around is not None:
+    if parts is not None:
         coverages.append(group.coverage_around(normals, directions, edge_radius))
-    planes = group.planes
-    if planes is not None and group.is_blocked_by_planes:
+    if planes is not None:
         front_weights, points = group.fronts_of_planes
         options = {"radius": edge_radius, "horizon_normals": normals, "front_weights": front_weights}
         coverages.append(
-            plane_coverage(points, planes.frames, planes.blockers, directions, skip=planes.skip, **options)
+            plane_coverage(points, planes.frames, planes.blockers, directions, self_plane=planes.self_plane, **options)
         )
     if coverages:
         transmittance = transmittance_past(transmittance, *coverages)

@@ -14,7 +14,8 @@ import warp as wp
 from warpshadow.device.constants import immutable
 from warpshadow.device.launch import without_gradient
 from warpshadow.device.tape import unrecorded
-from warpshadow.pipeline.receivers.groups import Blockers, Group
+from warpshadow.pipeline.bodies.blockers import Blockers
+from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces
 from warpshadow.stages.receivers.find import points_of_fragments
 from warpshadow.stages.receivers.quadtree import Quadtree, find_quadtree, probe_grid
@@ -52,7 +53,9 @@ def find_squares(
                 continue
             seen = fragments_of_samples(fragments, probes[columns])
             probes_of_body = points_of_fragments(positions, normals, merged_scene.faces, seen, footprint_inputs)
-            group = blockers.around_plane(*probes_of_body, body)
+            points, point_normals, footprints = probes_of_body
+            group_blockers = blockers.around(body)._replace(spheres=blockers.group_spheres(blockers.bodies))
+            group = Group(points, point_normals, group_blockers, footprints)
             portions = [share_of_sharpest_light(portion) for portion in group.portions()]
             known = [portion for portion in portions if portion is not None]
             if known:

@@ -35,10 +35,10 @@ def find_bodies_with_buried_vertices(
     visible_faces = np.unique(np.concatenate([*face_ids, np.empty(0, int)])).astype(int)
     margin = _ROUNDING * np.abs(positions).max(initial=0.0)
     starts = merged_scene.first_vertex
-    of_bodies = [positions[starts[number] : starts[number + 1]] for number in merged_scene.shadow_casters]
-    bounds = [(vertices.min(axis=0) - margin, vertices.max(axis=0) + margin) for vertices in of_bodies]
+    body_positions = [positions[starts[number] : starts[number + 1]] for number in merged_scene.shadow_casters]
+    bounds = [(vertices.min(axis=0) - margin, vertices.max(axis=0) + margin) for vertices in body_positions]
     is_plane = merged_scene.is_flat[merged_scene.shadow_casters]
-    planes = [vertices for vertices, is_flat in zip(of_bodies, is_plane, strict=True) if is_flat]
+    planes = [vertices for vertices, is_flat in zip(body_positions, is_plane, strict=True) if is_flat]
     mesh = normals = None
     for number, body in enumerate(bodies):
         corners = faces[visible_faces[merged_scene.body_of_face[visible_faces] == body]]

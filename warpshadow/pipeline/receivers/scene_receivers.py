@@ -1,11 +1,11 @@
-"""Which vertices and samples of a scene receive light, and which of them are told apart by body."""
+"""Which vertices and samples of a scene receive light, and which bodies of theirs are distinct."""
 
 from collections.abc import Hashable
 
 import numpy as np
 
+from warpshadow.pipeline.bodies.blockers import ONLY_SPHERES, BlockerKinds
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.receivers.shading_context import ONLY_SPHERES, BlockerKinds
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.stages.receivers.find import Numbering, number_receivers
 
@@ -50,13 +50,13 @@ class SceneReceivers:
             self._at_vertices[key] = sides[:, self._merged_scene.body_of_vertex]
         return self._at_vertices[key]
 
-    def separate_bodies(self, blocker_kinds: BlockerKinds) -> np.ndarray | None:
-        """Number of each body whose receivers are told apart, −1 for others, shape [body]; None where none are."""
+    def distinct_bodies(self, blocker_kinds: BlockerKinds) -> np.ndarray | None:
+        """Number of each distinct body, −1 for others, shape [body]; None where none is distinct."""
         bodies = np.arange(len(self._merged_scene.scene.bodies))
         if self._sends_light:
             return bodies
-        separate = {*blocker_kinds.separate, *np.flatnonzero(self._merged_scene.is_glossy).tolist()}
-        return np.where(np.isin(bodies, list(separate)), bodies, -1) if separate else None
+        distinct = {*blocker_kinds.distinct_bodies, *np.flatnonzero(self._merged_scene.is_glossy).tolist()}
+        return np.where(np.isin(bodies, list(distinct)), bodies, -1) if distinct else None
 
     def number_all(
         self, blocker_kinds: BlockerKinds, has_backs: bool, static_bodies: StaticBodies | None = None
@@ -67,11 +67,11 @@ class SceneReceivers:
         that rows cached for one serve the other.
         """
         moving = None if static_bodies is None else static_bodies.moving
-        key = frozenset(blocker_kinds.separate), blocker_kinds.bulging_bodies, moving
+        key = frozenset(blocker_kinds.distinct_bodies), blocker_kinds.bulging_bodies, moving
         if key not in self._numberings:
             device = self._merged_scene.device
-            both_sides, separate_bodies = self.at_vertices(blocker_kinds), self.separate_bodies(blocker_kinds)
-            bodies = None if separate_bodies is None else separate_bodies[self._merged_scene.body_of_vertex]
+            both_sides, distinct_bodies = self.at_vertices(blocker_kinds), self.distinct_bodies(blocker_kinds)
+            bodies = None if distinct_bodies is None else distinct_bodies[self._merged_scene.body_of_vertex]
             is_static = None if static_bodies is None else static_bodies.has_vertex
             fronts = both_sides[:1]
             if is_static is not None and (both_sides[1] & is_static).any():

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 import warp as wp
 
+from warpshadow.pipeline.bodies.blockers import ONLY_SPHERES, BlockerKinds
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Input, Node
@@ -23,23 +24,6 @@ if TYPE_CHECKING:
 
 Cached = TypeVar("Cached")
 Context = TypeVar("Context", bound="ShadingContext")
-
-
-class BlockerKinds(NamedTuple):
-    """Which bodies block light as planes, convex parts or by traced self-visibility; spheres block the rest."""
-
-    self_traced: tuple[int, ...] = ()  # bodies whose self-visibility is traced, not that of their spheres
-    rotations: Input | None = None  # of all bodies, mat33 of shape [batch, body]; None where they are not known
-    why_spheres: tuple[str, ...] = ()  # of each body, why it blocks its own light by spheres; empty for others
-    planes: tuple[int, ...] = ()  # bodies that block all light as the planes in which they lie
-    convex: tuple[int, ...] = ()  # bodies that block the light of others by the convex parts that they consist of
-    solids: tuple[int, ...] = ()  # convex bodies whose parts block their own light, too; of others rays are traced
-    bulging_bodies: tuple[int, ...] = ()  # bodies out of which their spheres bulge; they are lit at vertices
-
-    @property
-    def separate(self) -> set[int]:
-        """Bodies whose receivers are told apart; those lit alike still share a group."""
-        return {*self.self_traced, *self.solids, *self.planes}
 
 
 class AdaptiveSurfaces(NamedTuple):
@@ -60,9 +44,6 @@ class ReceiverCount(NamedTuple):
     moving: int  # those on bodies that may move
     static: int
     is_bound: bool = False  # whether there may be fewer that move
-
-
-ONLY_SPHERES = BlockerKinds()  # all bodies block by their spheres
 
 
 class ShadingContext:

@@ -55,8 +55,8 @@ def light_unevenness(
     device, result = merged_scene.device, np.zeros(len(bodies))
     eyes = np.concatenate([np.tile(camera.eye, (len(seen), 1)) for camera, seen, _ in images])
     seen, counts = (np.concatenate([image[item] for image in images]) for item in (1, 2))
-    of_body = [np.flatnonzero(merged_scene.body_of_face[seen] == body) for body in bodies]
-    chosen = [rows[:: -(-len(rows) // _FACES)] if len(rows) else rows for rows in of_body]
+    rows_by_body = [np.flatnonzero(merged_scene.body_of_face[seen] == body) for body in bodies]
+    chosen = [rows[:: -(-len(rows) // _FACES)] if len(rows) else rows for rows in rows_by_body]
     rows = np.concatenate(chosen)
     if not len(rows) or not (merged_scene.shadow_casters or emitter_luminance):
         return result

@@ -10,7 +10,10 @@ from warpshadow.device.batch import common_batch, cut
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import fibonacci
-from warpshadow.pipeline.receivers.groups import Blockers, Group
+from warpshadow.pipeline.bodies.blockers import Blockers
+from warpshadow.pipeline.bodies.convex import GroupConvexParts
+from warpshadow.pipeline.bodies.scene_planes import GroupPlanes
+from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.shading.transfers import join_portions
 from warpshadow.stages.emitters.convex_transmittance import find_log_transmittance_of_parts
 from warpshadow.stages.emitters.emitter_self_visibility import EmitterSelfVisibility, look_up_self_visibility
@@ -88,11 +91,11 @@ def find_highlights(
         end = first + portion.points.shape[1]
         seen = portion.points, portion.normals, cut(roughness, first, end), clip_matrices
         zeros = wp.zeros(portion.points.shape, dtype=wp.vec3, device=portion.points.device)
-        of_emitters = [
+        emitter_sums = [
             sum_highlights(*seen, placed_samples, radiance, *pair)
             for pair in _find_transmittances(emitters, self_visibility, portion, blockers, placed_samples)
         ]
-        sums.append([add_light(zeros, *parts) for parts in zip(*of_emitters, strict=True)] or [zeros, zeros])
+        sums.append([add_light(zeros, *parts) for parts in zip(*emitter_sums, strict=True)] or [zeros, zeros])
         first = end
     return LobeLight(*(join_portions(list(portions)) for portions in zip(*sums, strict=True)))
 
@@ -111,9 +114,10 @@ def _find_transmittances(
     merged_scene, points, normals = blockers.merged_scene, group.points, group.normals
     if not points.size:
         return
+    _spheres, planes, convex_parts, self_parts, _self_lookup, _body_sides = group.blockers
     transmittance_of_cells = (
         transmittance_past(None, group.self_coverage(EMITTER_CELLS))
-        if group.self_blocking_parts is not None
+        if self_parts is not None
         else group.looked_up_transmittance()
     )
     sphere_bodies = blockers.sphere_blockers(blockers.bodies)
@@ -155,8 +159,8 @@ def _find_transmittances(
             span,
             find_transmittance_to_samples(
                 log_of_spheres=find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped),
-                log_of_planes=_log_of_planes(group, blockers, placed_samples, span, body),
-                log_of_parts=_log_of_parts(group, placed_samples, span, body),
+                log_of_planes=planes and _log_of_planes(group, planes, blockers, placed_samples, span, body),
+                log_of_parts=convex_parts and _log_of_parts(group, convex_parts, placed_samples, span, body),
                 transmittance_self=transmittance_self,
                 transmittance_of_emitter=weigh_by_beam(points, placed_samples, span, transmittance_of_emitter),
             ),
@@ -173,12 +177,14 @@ def _find_where_enclosed(blockers: Blockers, emitter: int, body: int | None) -> 
     starts = blockers.merged_scene.first_vertex
     if is_readable(blockers.positions.device):
         positions = blockers.positions.numpy()
-        of_emitter, of_body = (positions[:, starts[number] : starts[number + 1]] for number in (emitter, body))
+        emitter_positions, body_positions = (
+            positions[:, starts[number] : starts[number + 1]] for number in (emitter, body)
+        )
     else:
         bodies = blockers.merged_scene.scene.bodies
-        of_emitter, of_body = (bodies[number].world_points()[None] for number in (emitter, body))
-    middle = (of_emitter.min(axis=1) + of_emitter.max(axis=1)) / 2
-    is_within: np.ndarray = ((of_body.min(axis=1) < middle) & (middle < of_body.max(axis=1))).all(axis=1)
+        emitter_positions, body_positions = (bodies[number].world_points()[None] for number in (emitter, body))
+    middle = (emitter_positions.min(axis=1) + emitter_positions.max(axis=1)) / 2
+    is_within: np.ndarray = ((body_positions.min(axis=1) < middle) & (middle < body_positions.max(axis=1))).all(axis=1)
     return is_within
 
 
@@ -224,25 +230,22 @@ def trace_transmittances(
 
 
 def _log_of_planes(
-    group: Group, blockers: Blockers, placed_samples: PlacedSamples, span: EmitterSpan, body: int
-) -> wp.array | None:
-    """Logarithm of the transmittance of planes between a group and an emitter; None without any."""
-    planes, numbers = group.planes, blockers.blocker_kinds.planes
-    if planes is None or not group.is_blocked_by_planes:
-        return None
+    group: Group, planes: GroupPlanes, blockers: Blockers, placed_samples: PlacedSamples, span: EmitterSpan, body: int
+) -> wp.array:
+    """Logarithm of the transmittance of planes between a group and an emitter."""
+    numbers = blockers.blocker_kinds.planes
     assert blockers.body_sides is not None
     points, sides = group.fronts_of_planes.lifted_points, blockers.body_sides.sides_of(planes.frames, planes.blockers)
-    skipped = -1 if planes.skip is None else planes.skip, numbers.index(body) if body in numbers else -1
+    skipped = -1 if planes.self_plane is None else planes.self_plane, numbers.index(body) if body in numbers else -1
     return find_log_transmittance_of_planes(
         points, group.normals, placed_samples, span, planes.frames, planes.blockers, sides, body, skipped
     )
 
 
-def _log_of_parts(group: Group, placed_samples: PlacedSamples, span: EmitterSpan, body: int) -> wp.array | None:
-    """Logarithm of the transmittance of convex parts between a group and an emitter; None without any."""
-    parts = group.convex_parts_around
-    if parts is None:
-        return None
+def _log_of_parts(
+    group: Group, parts: GroupConvexParts, placed_samples: PlacedSamples, span: EmitterSpan, body: int
+) -> wp.array:
+    """Logarithm of the transmittance of convex parts between a group and an emitter."""
     skipped = -1 if group.body is None else parts.number_of(group.body), parts.number_of(body)
     return find_log_transmittance_of_parts(
         group.points, group.normals, placed_samples, span, parts.placed_parts, parts.blockers, skipped

@@ -238,8 +238,8 @@ class SceneEmitters:
         """Their light in the lobes of receivers, G and G', given transmittance as for :meth:`traced_light`."""
         seen = receivers.points, receivers.normals, roughness, clip_matrices, placed_samples, radiance
         pairs = self._within_beams(receivers, placed_samples, transmittance)
-        of_emitters = [sum_highlights(*seen, *pair) for pair in pairs]
-        return LobeLight(*(add_light(*parts) for parts in zip(*of_emitters, strict=True)))
+        emitter_sums = [sum_highlights(*seen, *pair) for pair in pairs]
+        return LobeLight(*(add_light(*parts) for parts in zip(*emitter_sums, strict=True)))
 
     def _within_beams(
         self, receivers: Receivers, placed_samples: PlacedSamples, transmittance: list[wp.array]

@@ -12,18 +12,12 @@ import warp as wp
 
 from warpshadow.assets.basis import Basis, HarmonicBasis, conversion
 from warpshadow.assets.known_light import as_light
-from warpshadow.assets.light import EnvironmentMap
+from warpshadow.pipeline.bodies.blockers import ONLY_SPHERES, BlockerKinds
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Input, Node
-from warpshadow.pipeline.receivers.shading_context import (
-    ONLY_SPHERES,
-    AdaptiveSurfaces,
-    BlockerKinds,
-    ShadingContext,
-    receiver_text,
-)
+from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.transfers import LightArgument, check_light, shade_free
 from warpshadow.stages.receivers.quadtree import Quadtree
@@ -144,17 +138,17 @@ class Method(abc.ABC):
         is_of_scene = light is None or light is self.merged_scene.scene.light
         if is_of_scene and shell is None:
             return self.light
-        shell_input = self._shell_input(points, light, shell)
         if isinstance(light, wp.array):
-            return LightInput(light, shell_input, why_new="light is given")
+            return LightInput(light, self._shell_input(points, shell), why_new="light is given")
         known = self.light.value() if light is None else as_light(light)
+        if shell is None and known.shell is not None:  # it is not that of the scene
+            shell = shell_array(known.shell, self.merged_scene.device)
+        shell_input = self._shell_input(points, shell)
         why_new = "" if points.last_cached("light") is None else "light changed since the last call"
         return points.cached("light", (known, shell_input), lambda: LightInput(known, shell_input, why_new=why_new))
 
-    def _shell_input(self, points: ShadingContext, light: LightArgument | None, shell: wp.array | None) -> Input | None:
+    def _shell_input(self, points: ShadingContext, shell: wp.array | None) -> Input | None:
         """The shell of light that is not the scene's, the same while its values are; None for the scene's."""
-        if isinstance(light, EnvironmentMap) and light.shell is not None and shell is None:
-            shell = shell_array(light.shell, self.merged_scene.device)
         if shell is None:
             return None
         if self.shell is None:

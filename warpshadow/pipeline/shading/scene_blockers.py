@@ -7,15 +7,15 @@ import numpy as np
 import warp as wp
 
 from warpshadow.maths.convex import is_panel
+from warpshadow.pipeline.bodies.blockers import ONLY_SPHERES, BlockerKinds, Blockers
 from warpshadow.pipeline.bodies.convex import SceneConvexParts
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.bodies.scene_planes import ScenePlanes
+from warpshadow.pipeline.bodies.scene_planes import BodySides, ScenePlanes
 from warpshadow.pipeline.bodies.self_visibility import FREE_SHAPE, SelfVisibility
 from warpshadow.pipeline.node import Input
-from warpshadow.pipeline.receivers.groups import Blockers, BodySides
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
-from warpshadow.pipeline.receivers.shading_context import ONLY_SPHERES, BlockerKinds, ShadingContext, receiver_text
+from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
 from warpshadow.scene.blockers import why_spheres_block
 
 _MANY_EDGES = 400
@@ -108,7 +108,7 @@ class SceneBlockers:
     def _sphere_counts(self, kinds: BlockerKinds) -> np.ndarray:
         """Number of spheres by which each body blocks the light of others."""
         counts = self._merged_scene.sphere_counts.copy()
-        counts[[*kinds.planes, *kinds.convex]] = 0
+        counts[list(kinds.without_spheres)] = 0
         return counts
 
     def _part_counts(self, kinds: BlockerKinds) -> np.ndarray:

@@ -13,13 +13,15 @@ from warpshadow.assets.known_light import KnownLight
 from warpshadow.assets.light import EnvironmentMap
 from warpshadow.device.constants import IdentityKey
 from warpshadow.device.progress import progress_bar
+from warpshadow.pipeline.bodies.blockers import BlockerKinds, Blockers
 from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.bodies.self_visibility import SelfLookup
 from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached, identity
-from warpshadow.pipeline.receivers.groups import Blockers, CellVisibility, Group, HarmonicVisibility, find_portions
-from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, BlockerKinds, ShadingContext, receiver_text
+from warpshadow.pipeline.receivers.groups import Group, find_portions
+from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, ShadingContext, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
+from warpshadow.pipeline.shading.found_visibility import CellVisibility, HarmonicVisibility
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.shading.scene_blockers import SceneBlockers
@@ -158,7 +160,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
     def self_lookups(
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: Projected
     ) -> Mapping[int, SelfLookup]:
-        """Self-visibility of receivers of some bodies, :attr:`.ReceiverBodies.lookup`. Differentiable: rotations."""
+        """Self-visibility of receivers of some bodies, by body. Differentiable: rotations."""
 
     @abc.abstractmethod
     def find_visibility(self, group: Group, projected_light: Projected) -> FoundVisibility:
@@ -290,7 +292,8 @@ class VisibilityNode(Node):
         join: Makes the value of the list of these; by default the list itself, of shading one array.
     """
 
-    step_count = 2  # of the four steps: visibility, planes, transfer vectors, shading
+    steps: tuple[str, ...] = ("visibility", "planes")
+    """Its steps, each a row of ``explain``."""
     join: Callable[[list[Any]], Any] = staticmethod(identity)
 
     def __init__(
@@ -310,23 +313,25 @@ class VisibilityNode(Node):
         self._progress, weak_points = method.progress and light is not None, points.weak_reference
         suffix, planes = points.suffix if suffix is None else suffix, points.blocker_kinds.planes
         item_text = functools.partial(receiver_text, weak_points)
-        self._visibility = ExplainRow(
-            f"visibility{suffix}",
-            lambda: method.scene_blockers.pairs_with(weak_points),
-            lambda: _why_unblocked(method, weak_points),
-        )
-        self._planes = ExplainRow(
-            f"planes{suffix}",
-            lambda: f"{item_text()} × {len(planes)} flat {'body' if len(planes) == 1 else 'bodies'}",
-            "" if planes else "no flat body casts shadows by its plane",
-        )
-        self._transfer = ExplainRow(
-            f"transfer{suffix}",
-            lambda: f"{item_text()} × {method.coefficient_count(light)} coefficients",
-            "" if self.needs_transfer else "shading takes transmittance at once",
-        )
-        self._shading = ExplainRow(f"shading{suffix}", item_text)
-        steps = self._visibility, self._planes, self._transfer, self._shading
+        rows = {
+            "visibility": ExplainRow(
+                f"visibility{suffix}",
+                lambda: method.scene_blockers.pairs_with(weak_points),
+                lambda: _why_unblocked(method, weak_points),
+            ),
+            "planes": ExplainRow(
+                f"planes{suffix}",
+                lambda: f"{item_text()} × {len(planes)} flat {'body' if len(planes) == 1 else 'bodies'}",
+                "" if planes else "no flat body casts shadows by its plane",
+            ),
+            "transfer": ExplainRow(
+                f"transfer{suffix}",
+                lambda: f"{item_text()} × {method.coefficient_count(light)} coefficients",
+                "" if self.needs_transfer else "shading takes transmittance at once",
+            ),
+            "shading": ExplainRow(f"shading{suffix}", item_text),
+        }
+        self._rows = {step: rows[step] for step in self.steps}
         super().__init__(
             "",
             None,
@@ -336,14 +341,14 @@ class VisibilityNode(Node):
             self_visibility_node(method, points, projected_light),
             _static_shadows_node(method, points, light),
             None if points.static_bodies is None else points.static_bodies.normals,
-            rows=steps[: self.step_count],
+            rows=tuple(self._rows.values()),
             caches=caches,
         )
 
     @property
     def needs_transfer(self) -> bool:
         """Whether transfer vectors are found."""
-        return self.step_count > 2
+        return "transfer" in self.steps
 
     def compute(self, call: Call) -> Any:
         """Find it for all portions."""
@@ -362,10 +367,10 @@ class VisibilityNode(Node):
     def _find_visibility(
         self, call: Call, group: Group, projected_light: ProjectedLight
     ) -> CellVisibility | HarmonicVisibility:
-        with self.timed(call, self._visibility):
+        with self.timed(call, self._rows["visibility"]):
             visibility: CellVisibility | HarmonicVisibility = self.method.find_visibility(group, projected_light)
-        if group.planes is not None:
-            with self.timed(call, self._planes):
+        if group.blockers.planes is not None:
+            with self.timed(call, self._rows["planes"]):
                 visibility = self.method.find_visibility_past_planes(group, visibility, projected_light)
         return visibility
 
@@ -377,20 +382,20 @@ class VisibilityNode(Node):
 class TransferNode(VisibilityNode):
     """Transfer vectors of receivers."""
 
-    step_count = 3
+    steps = (*VisibilityNode.steps, "transfer")
 
     def add_step(self, call: Call, portion: LitPortion, projected_light: ProjectedLight) -> LitPortion:
         """The portion with its transfer vectors, if they are needed."""
         if not self.needs_transfer:
             return portion
-        with self.timed(call, self._transfer):
+        with self.timed(call, self._rows["transfer"]):
             return portion._replace(result=self.method.transfer(portion.visibility, portion.group, projected_light))
 
 
 class ShadingNode(TransferNode):
     """Shading of receivers, vec3 of shape [batch, receiver]."""
 
-    step_count = 4
+    steps = (*TransferNode.steps, "shading")
     join = staticmethod(join_portions)
 
     @property
@@ -401,7 +406,7 @@ class ShadingNode(TransferNode):
     def add_step(self, call: Call, portion: LitPortion, projected_light: ProjectedLight) -> LitPortion:
         """The portion with its shading."""
         transfer = super().add_step(call, portion, projected_light).result
-        with self.timed(call, self._shading):
+        with self.timed(call, self._rows["shading"]):
             result = (
                 self.method.shade_transmittance(portion.visibility, portion.group, projected_light)
                 if transfer is None

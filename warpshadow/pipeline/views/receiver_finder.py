@@ -8,8 +8,9 @@ import warp as wp
 from warpshadow.device.constants import constant, gather_of_owners
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.launch import without_gradient
+from warpshadow.pipeline.bodies.blockers import BlockerKinds
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
-from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, BlockerKinds
+from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.image.outlines import find_outline_samples
@@ -46,7 +47,7 @@ class ReceiverFinder:
     ):
         self._method, self._merged_scene, self._scene_receivers = method, method.merged_scene, scene_receivers
         self._blocker_kinds, self._static_bodies = blocker_kinds, static_bodies
-        self._separate_bodies = scene_receivers.separate_bodies(blocker_kinds)
+        self._distinct_bodies = scene_receivers.distinct_bodies(blocker_kinds)
         self._supersampling = supersampling
         self._may_share_surfaces = method.shares_directions and supersampling <= MAX_SHARED_SAMPLES
 
@@ -93,7 +94,7 @@ class ReceiverFinder:
         shares_surfaces = (
             self._may_share_surfaces and min(fragments.face_ids.shape[1:]) >= _MIN_SHARED_SIZE * self._supersampling
         )
-        body_of_face, separate = merged_scene.body_of_face, self._separate_bodies
+        body_of_face, distinct_bodies = merged_scene.body_of_face, self._distinct_bodies
         widens = method.edges_as_wide_as_footprints and self._footprint_widths.any()
         return find_receivers(
             positions,
@@ -102,7 +103,7 @@ class ReceiverFinder:
             fragments,
             numbering,
             gather_of_owners(at_samples, body_of_face),
-            bodies=None if separate is None else gather_of_owners(separate, body_of_face),
+            bodies=None if distinct_bodies is None else gather_of_owners(distinct_bodies, body_of_face),
             supersampling=1 if method.shares_directions and not shares_surfaces else self._supersampling,
             quadtree=quadtree,
             lifts_to_smooth_surface=scene_receivers.at_all_samples,
@@ -124,7 +125,7 @@ class ReceiverFinder:
 
     def _number_seen(self, is_seen: np.ndarray, has_cached_rows: np.ndarray) -> Numbering:
         """Number the vertices that are seen, of bodies with receivers there and of bodies with cached rows."""
-        merged_scene, static_bodies, separate = self._merged_scene, self._static_bodies, self._separate_bodies
+        merged_scene, static_bodies, distinct_bodies = self._merged_scene, self._static_bodies, self._distinct_bodies
         keeps_vertex = self._scene_receivers.at_vertices(self._blocker_kinds)[: len(is_seen)] & is_seen
         if has_cached_rows.any():
             keeps_vertex |= gather_of_owners(has_cached_rows, merged_scene.body_of_vertex) & is_seen
@@ -132,7 +133,7 @@ class ReceiverFinder:
             keeps_vertex,
             None if static_bodies is None else static_bodies.has_vertex,
             merged_scene.vertex_order,
-            None if separate is None else gather_of_owners(separate, merged_scene.body_of_vertex),
+            None if distinct_bodies is None else gather_of_owners(distinct_bodies, merged_scene.body_of_vertex),
             device=merged_scene.device,
         )
 

@@ -17,11 +17,12 @@ from warpshadow.assets.camera import Camera
 from warpshadow.device.batch import common_batch
 from warpshadow.device.constants import note_use
 from warpshadow.device.cuda_graph import is_readable
+from warpshadow.pipeline.bodies.blockers import BlockerKinds
 from warpshadow.pipeline.bodies.geometry import PLACED, Geometry, as_geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Clock, Input, Node, identity
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
-from warpshadow.pipeline.receivers.shading_context import BlockerKinds, ShadingContext
+from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.view import View
@@ -189,7 +190,7 @@ class SceneViews:
         Differentiable: geometry.
         """
         merged_scene, blocker_kinds, bodies = self._merged_scene, self._blocker_kinds(geometry), self._bodies(geometry)
-        owners = self._receivers.separate_bodies(blocker_kinds)
+        owners = self._receivers.distinct_bodies(blocker_kinds)
         if owners is not None:
             owners = owners[merged_scene.body_of_face[sides % len(merged_scene.body_of_face)]]
         normals = Node("", vertex_normals, bodies[0], merged_scene.faces)

@@ -9,10 +9,11 @@ import warp as wp
 
 from warpshadow.assets.camera import Camera
 from warpshadow.device.launch import without_gradient
+from warpshadow.pipeline.bodies.blockers import BlockerKinds
 from warpshadow.pipeline.bodies.reflectance import Materials, SampleReflectance
 from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached, field_of, identity
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
-from warpshadow.pipeline.receivers.shading_context import BlockerKinds, ReceiverCount, ShadingContext, receiver_text
+from warpshadow.pipeline.receivers.shading_context import ReceiverCount, ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.transport import LightTransport

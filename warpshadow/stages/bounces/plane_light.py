@@ -179,7 +179,7 @@ def plane_light(
     *,
     coverages: wp.array | None = None,
     front_weights: wp.array | None = None,
-    skip: int | None = None,
+    self_plane: int | None = None,
     addend: wp.array | None = None,
 ) -> wp.array:
     """Light that planes send to receivers, added to other light.
@@ -195,13 +195,13 @@ def plane_light(
             shape [batch, receiver, direction]; None where it is not known.
         front_weights: Part of the front of each plane that receivers see, float32 of shape [batch, receiver,
             plane], from :func:`warpshadow.stages.planes.fronts.find_fronts`; by default their heights decide.
-        skip: Number of the plane that the receivers are part of, which sends them nothing; None for none.
+        self_plane: Number of the plane that the receivers are part of, which sends them nothing; None for none.
         addend: The other light, vec3 of shape [batch, receiver]; None for 0.
     Returns:
         Light that white receivers reflect of it, vec3 of shape [batch, receiver].
     Differentiable: points, normals, transmittance, frames, texels, coverages, front_weights, addend.
     """
-    check_planes(planes, points, frames, directions, skip)
+    check_planes(planes, points, frames, directions, self_plane)
     check.shape("normals", normals.shape, ("batch", points.shape[1]))
     check.shape("transmittance", transmittance.shape, ("batch", points.shape[1], len(directions)))
     arguments = {"points": points, "normals": normals, "transmittance": transmittance, "coverages": coverages}
@@ -209,14 +209,14 @@ def plane_light(
     batch_count = common_batch(arguments)
     addend = None if addend is None else expand(addend, batch_count)
     light = begin_sum(addend, (batch_count, points.shape[1]), points.device)
-    if planes.count == (skip is not None):
+    if planes.count == (self_plane is not None):
         return light if addend is None else addend
     points, normals = (expand(array, batch_count) for array in (points, normals))
     transmittance = expand_rows(transmittance, batch_count)
     coverages, front_weights = (
         None if array is None else expand_rows(array, batch_count) for array in (coverages, front_weights)
     )
-    arrays = plane_arrays(planes, cell_radius(len(directions)), skip)
+    arrays = plane_arrays(planes, cell_radius(len(directions)), self_plane)
     cell_directions = constant(directions, wp.vec3, points.device)
     planes_seen = plane_inputs(points, frames, front_weights, arrays)
     inputs = [planes_seen, normals, transmittance, coverages, texels, cell_directions]

@@ -14,9 +14,8 @@ from warpshadow.stages.receivers.body_spans import (
     Span,
     SpanValues,
     receiver_spans,
-    span_of_receiver,
     span_values,
-    value_of_span,
+    value_of_receiver,
 )
 
 
@@ -37,7 +36,7 @@ def _interpolate_probes(
     light_batch = instance_in(batch, probe_light.shape[0])
     probe_batch = instance_in(batch, probe_indices.shape[0])
     receiver_light = wp.vec3()
-    first_probe = value_of_span(first_probes, span_of_receiver(spans, receiver))
+    first_probe = value_of_receiver(first_probes, spans, receiver)
     if first_probe >= 0:
         probes = probe_indices[probe_batch, receiver] + wp.vec3i(first_probe, first_probe, first_probe)
         receiver_light += interpolate_at(probe_light[light_batch], probes, weights[probe_batch, receiver])

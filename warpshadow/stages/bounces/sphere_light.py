@@ -22,7 +22,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, instance_in
-from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, span_count, vectors_type
+from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, sector_count, vectors_type
 from warpshadow.device.launch import launch_with_adjoint, varies
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, run_dimensions, scratch_slot, split_launch
@@ -62,7 +62,7 @@ _SUMS = 4  # Σ w a L, of three colors, and Σ w a S
 
 @functools.cache
 def _task_type(lanes: int) -> Any:
-    """Struct of a thread's work: a span of bundles of directions."""
+    """Struct of a thread's work: a sector of directions."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
 
     @wp.struct
@@ -97,7 +97,7 @@ class LightInputs:
     transmittance: wp.array3d(dtype=wp.float32)
     transmittance_others: wp.array3d(dtype=wp.float32)
     factor: float
-    span_count: int
+    sector_count: int
     stores_sums: bool
 
 
@@ -133,7 +133,7 @@ def _make_load_task(lanes: int) -> wp.Function:
     @wp.func(inline=lanes == 1)
     def load_task(
         row: int,
-        span: int,
+        sector: int,
         worker: int,
         inputs: LightInputs,
         scratch: wp.array3d(dtype=Lane),
@@ -143,11 +143,11 @@ def _make_load_task(lanes: int) -> wp.Function:
         block, receivers = load_receivers(inputs.traversed, row)
         batch = block.batch
         spheres = inputs.traversed.spheres
-        item = row * inputs.span_count + span
+        item = row * inputs.sector_count + sector
         slot = scratch_slot(worker, item)
         task = LightTask()
         task.cells = inputs.cells
-        task.first_bundle = span * (scratch.shape[2] // BUNDLE)
+        task.first_bundle = sector * (scratch.shape[2] // BUNDLE)
         task.reached_bundles = reached_bundles[slot]
         task.stops = reached_bundles[slot, 2]
         task.blocked = scratch[slot, 0]
@@ -234,10 +234,10 @@ def _make_light(lanes: int) -> wp.Kernel:
         # out
         light: wp.array2d(dtype=wp.vec3),
     ):
-        """A thread owns a block of receivers and a span of bundles, and adds to the light."""
+        """A thread owns a block of receivers and a sector of directions, and adds to the light."""
         i, j = wp.tid()
-        span, row = split_launch(worker, first_row + i, j)
-        block, receivers, task = load_task(row, span, worker, inputs, scratch, reached_bundles, sums)
+        sector, row = split_launch(worker, first_row + i, j)
+        block, receivers, task = load_task(row, sector, worker, inputs, scratch, reached_bundles, sums)
         for bundle in range(task.stops.shape[0]):
             if task.stops[bundle] > 0:
                 for k in range(BUNDLE * SUMS):
@@ -359,13 +359,13 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         adj_radii: wp.array2d(dtype=wp.float32),
         adj_extents: wp.array2d(dtype=wp.float32),
     ):
-        """A thread owns a block of receivers and a span of bundles.
+        """A thread owns a block of receivers and a sector of directions.
 
         T̄ = −4/Q max(n·ω, 0) Ī·R = −F̄,  n̄ = 4/Q Σ ω (F − T) Ī·R where n·ω > 0
         """
         i, j = wp.tid()
-        span, row = split_launch(worker, first_row + i, j)
-        block, receivers, task = load_task(row, span, worker, inputs, scratch, reached_bundles, sums)
+        sector, row = split_launch(worker, first_row + i, j)
+        block, receivers, task = load_task(row, sector, worker, inputs, scratch, reached_bundles, sums)
         batch = block.batch
         task.adj_light = load(adj_light[batch][block.first : block.end], block.number)
         if adj_radiance:
@@ -392,7 +392,7 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
             add_vectors(adj_receivers.points, block.number, adj_points[batch][block.first : block.end])
         if adj_normals:
             add_vectors(adj_normal, block.number, adj_normals[batch][block.first : block.end])
-        if adj_addend and span == 0:
+        if adj_addend and sector == 0:
             add_vectors(task.adj_light, block.number, adj_addend[batch][block.first : block.end])
 
     return add_light_adjoint
@@ -457,30 +457,30 @@ def sphere_light(
         check.shape("transmittance_others", transmittance_others.shape, (len(transmittance_others), *directions_shape))
     if equations is not None:
         check.shape("tangent_planes", equations.shape, (len(equations), proxy_count))
-    device, lanes, spans = points.device, traversal.lanes, span_count(points.device, len(directions))
-    span_direction_count = len(directions) // spans
+    device, lanes, sectors = points.device, traversal.lanes, sector_count(points.device, len(directions))
+    sector_direction_count = len(directions) // sectors
     is_shared = transmittance_others is not None and len(transmittance_others) < len(points)
     addend = None if addend is None else expand(addend, len(points))
     variables = [points, normals, transmittance, addend, *([] if is_shared else [transmittance_others])]
     shared = [*([transmittance_others] if is_shared else []), proxy_radiance, equations, *traversal.nodes]
     stores_sums = varies([*variables, *shared])
     scratch = [
-        Scratch((3, span_direction_count), lane_type(lanes)),
-        Scratch((3, span_direction_count // BUNDLE), wp.int32),
+        Scratch((3, sector_direction_count), lane_type(lanes)),
+        Scratch((3, sector_direction_count // BUNDLE), wp.int32),
     ]
-    sums = Scratch((span_direction_count * _SUMS,), lane_type(lanes))
-    stored = [empty((traversal.row_count * spans, *sums.shape), sums.dtype, device=device)] if stores_sums else []
+    sums = Scratch((sector_direction_count * _SUMS,), lane_type(lanes))
+    stored = [empty((traversal.row_count * sectors, *sums.shape), sums.dtype, device=device)] if stores_sums else []
     inputs = LightInputs()
     inputs.traversed, inputs.cells = traversal.inputs, cells
     inputs.proxy_radiance, inputs.transmittance = proxy_radiance, transmittance
     inputs.transmittance_others = transmittance_others
     if equations is not None:
         inputs.equations, inputs.tolerances = equations, tolerances
-    inputs.factor, inputs.span_count, inputs.stores_sums = 4 / len(directions), spans, stores_sums
+    inputs.factor, inputs.sector_count, inputs.stores_sums = 4 / len(directions), sectors, stores_sums
     return launch_with_adjoint(
         _make_light(lanes),
         lambda: _make_light_adjoint(lanes),
-        run_dimensions(device, traversal.row_count, spans),
+        run_dimensions(device, traversal.row_count, sectors),
         inputs=[inputs],
         result=begin_sum(addend, points.shape, device),
         variables=variables,
@@ -488,5 +488,5 @@ def sphere_light(
         outputs=stored,
         adj_inputs=stored,
         scratch=scratch if stores_sums else [*scratch, sums],
-        cost=PAIR_COST * lanes * radii.shape[1] * span_direction_count,
+        cost=PAIR_COST * lanes * radii.shape[1] * sector_direction_count,
     )

@@ -74,7 +74,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         slot, instance = scratch_slot(worker, row), instance_in(block.batch, inputs.corners.shape[0])
         task = PartsTask()
         task.block = block
-        task.skip = value_of_span(inputs.skips, block.span)
+        task.self_body = value_of_span(inputs.self_bodies, block.span)
         task.slot = slot
         task.instance = instance
         task.bounds = inputs.bounds[instance]
@@ -99,10 +99,10 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
         return task
 
     @wp.func
-    def is_blocking(inputs: PartInputs, compound: int, skip: int):
+    def is_blocking(inputs: PartInputs, compound: int, self_body: int):
         """Whether a compound blocks light of the receivers."""
         piece = inputs.parts.first_piece[compound]
-        return inputs.parts.bodies[piece] != skip and inputs.parts.blocks[piece] == 1
+        return inputs.parts.bodies[piece] != self_body and inputs.parts.blocks[piece] == 1
 
     @wp.func
     def bound_by_hull(inputs: PartInputs, hull: int, task: PartsTask, covered_count: int):
@@ -174,7 +174,7 @@ def _make_part_functions(lanes: int) -> _PartFunctions:
     def cover_by_all_compounds(inputs: PartInputs, task: PartsTask):
         """Store sums over all compounds for each cell."""
         for compound in range(inputs.parts.hulls.shape[0]):
-            if is_blocking(inputs, compound, task.skip):
+            if is_blocking(inputs, compound, task.self_body):
                 covered_count = cover_by_compound(inputs, compound, task)
                 for k in range(covered_count):
                     q = task.covered[k]
@@ -270,7 +270,7 @@ def _make_cover_adjoint(lanes: int) -> wp.Kernel:
         adj_point = Vectors()
         for compound in range(parts.hulls.shape[0]):
             covered_count = int(0)
-            if is_blocking(inputs, compound, task.skip):
+            if is_blocking(inputs, compound, task.self_body):
                 covered_count = cover_by_compound(inputs, compound, task)
             affected_count = int(0)
             for k in range(covered_count):
@@ -333,7 +333,7 @@ def part_coverage(
     radius: float | None = None,
     horizon_normals: wp.array | None = None,
     body_spans: Sequence[Span] = (),
-    skips: Sequence[int] = (-1,),
+    self_bodies: Sequence[int] = (-1,),
     on_surface: bool = False,
 ) -> wp.array:
     """Coverage (h, μ) of cells by the convex parts of bodies.
@@ -345,7 +345,7 @@ def part_coverage(
         radius: Of cells that do not tile the sphere [rad]; by default that of so many even ones, which do.
         horizon_normals: Normals, vec3 of shape [batch, receiver]: nothing blocks cells below the horizon.
         body_spans: Of the receivers, by body; () for one of all.
-        skips: Number of each span's body among the blockers, which blocks none of its light; −1 for none.
+        self_bodies: Number of each span's body among the blockers, which blocks none of its light; −1 for none.
         on_surface: Whether receivers lie on the parts, which are those of one body, and have ``horizon_normals``: a
             part blocks no light of receivers that lie on a face of it and look out, nor below their tangent planes.
 
@@ -356,8 +356,8 @@ def part_coverage(
     """
     check.shape("points", points.shape, ("batch", "receiver"))
     check.shape("directions", directions.shape, ("direction", 3))
-    for skip in skips:
-        check.choice("skips", skip, range(-1, blockers.body_count))
+    for self_body in self_bodies:
+        check.choice("self_bodies", self_body, range(-1, blockers.body_count))
     points = expand(points, common_batch({"points": points, "corners": placed_parts.corners}))
     inputs = PartInputs()
     inputs.points, inputs.parts, inputs.cells = points, blockers.arrays, make_cells(directions, SOFTNESS, points.device)
@@ -366,7 +366,7 @@ def part_coverage(
     inputs.corners, inputs.face_planes, inputs.bounds = placed_parts
     inputs.radius = cell_radius(len(directions)) if radius is None else radius
     inputs.spans = receiver_spans(body_spans, points.shape[1], lane_count(points.device), points.device)
-    inputs.skips = span_values(skips, points.device)
+    inputs.self_bodies = span_values(self_bodies, points.device)
     inputs.on_surface = on_surface
     lanes = lane_count(points.device)
     edge_count = blockers.edge_count

@@ -36,7 +36,7 @@ class PartInputs:
     cells: DirectionCells
     radius: float  # of cells
     spans: ReceiverSpans
-    skips: SpanValues  # the body that the receivers are part of, −1 for none
+    self_bodies: SpanValues  # number of its body among the blockers, −1 for none
     on_surface: bool  # whether receivers lie on the parts, which then are those of one body
 
 
@@ -76,7 +76,7 @@ def task_type(lanes: int) -> Any:
     @wp.struct
     class PartsTask:
         block: ReceiverBlock
-        skip: int  # the body that the receivers are part of, −1 for none
+        self_body: int  # the body that the receivers are part of, −1 for none
         slot: int  # of scratch memory
         instance: int  # of the parts
         bounds: wp.array(dtype=wp.vec4)  # [part]

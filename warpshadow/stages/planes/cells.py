@@ -40,29 +40,29 @@ class PlaneArrays:
     covered: wp.array(dtype=wp.vec3)
     edges: wp.array(dtype=wp.vec4)
     edge_axes: wp.array(dtype=wp.vec2)
-    skip: int  # the plane that the receivers are part of, -1 for none
+    self_plane: int  # the plane that the receivers are part of, -1 for none
     radius: float  # ρ
     per_radius: float
 
 
 def check_planes(
-    planes: PlaneBlockers, points: wp.array, frames: wp.array, directions: np.ndarray, skip: int | None
+    planes: PlaneBlockers, points: wp.array, frames: wp.array, directions: np.ndarray, self_plane: int | None
 ) -> None:
     """Raise ValueError for arrays that do not fit together."""
     check.shape("points", points.shape, ("batch", "receiver"))
     check.shape("directions", directions.shape, ("direction", 3))
     check.shape("frames", frames.shape, ("batch", 3 * planes.count))
-    if skip is not None:
-        check.choice("skip", skip, range(planes.count))
+    if self_plane is not None:
+        check.choice("self_plane", self_plane, range(planes.count))
 
 
 @functools.lru_cache(64)
-def plane_arrays(planes: PlaneBlockers, radius: float, skip: int | None) -> PlaneArrays:
+def plane_arrays(planes: PlaneBlockers, radius: float, self_plane: int | None) -> PlaneArrays:
     """Plane blockers as seen in cells of a radius [rad] by receivers that are part of one, or of none."""
     arrays = PlaneArrays()
     arrays.grids, arrays.levels, arrays.level_scales = planes.grids, planes.levels, planes.level_scales
     arrays.covered, arrays.edges, arrays.edge_axes = planes.covered, planes.edges, planes.edge_axes
-    arrays.skip, arrays.radius = -1 if skip is None else skip, radius
+    arrays.self_plane, arrays.radius = -1 if self_plane is None else self_plane, radius
     arrays.per_radius = 1 / arrays.radius
     return arrays
 

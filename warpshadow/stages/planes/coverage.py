@@ -178,7 +178,7 @@ def plane_coverage(
     radius: float | None = None,
     horizon_normals: wp.array | None = None,
     front_weights: wp.array | None = None,
-    skip: int | None = None,
+    self_plane: int | None = None,
 ) -> wp.array | None:
     """Coverage (h, μ) of cells by the planes that cast shadows: an h of 1 and more need not be complete.
 
@@ -192,19 +192,19 @@ def plane_coverage(
         horizon_normals: Normals, vec3 of shape [batch, receiver]: nothing covers cells below the horizon.
         front_weights: Part of the front of each plane that receivers see, from :func:`.fronts.find_fronts`, float32 of
             shape [batch, receiver, plane]; by default their heights decide.
-        skip: Number of the plane that the receivers are part of, which blocks none of their light; None for none.
+        self_plane: Number of the plane that the receivers are part of, which blocks none of their light; None for none.
     Returns:
         vec4 of shape [batch, receiver, direction], for :func:`warpshadow.stages.joint_coverage.transmittance_past`; h
         is 1 or more where nothing passes. None where no plane casts a shadow on them.
     Differentiable: points, frames, front_weights. Not: horizon_normals, which decide by steps, and how much receivers
     in a plane see of a cell.
     """
-    check_planes(planes, points, frames, directions, skip)
+    check_planes(planes, points, frames, directions, self_plane)
     count = common_batch({"points": points, "frames": frames, "front_weights": front_weights})
     points, front_weights = expand(points, count), None if front_weights is None else expand_rows(front_weights, count)
     radius_of_cells = cell_radius(len(directions)) if radius is None else radius
-    arrays = plane_arrays(planes, radius_of_cells, skip)
-    if not set(planes.is_blocking) - {skip}:
+    arrays = plane_arrays(planes, radius_of_cells, self_plane)
+    if not set(planes.is_blocking) - {self_plane}:
         return None
     cells = constant(directions, wp.vec3, points.device)
     inputs = [plane_inputs(points, frames, front_weights, arrays), horizon_normals, cells]

@@ -46,9 +46,8 @@ from warpshadow.stages.receivers.body_spans import (
     Span,
     SpanValues,
     receiver_spans,
-    span_of_receiver,
     span_values,
-    value_of_span,
+    value_of_receiver,
 )
 
 _FRONT_RADIUS_RATIO = wp.constant(1.25)
@@ -189,7 +188,7 @@ def _find_fronts(
     blocker_indices: wp.array(dtype=wp.int32),
     frames: wp.array2d(dtype=wp.vec3),
     grids: wp.array(dtype=PlaneGrid),
-    skip: int,
+    self_plane: int,
     # out
     front_weights: wp.array3d(dtype=wp.float32),
     lifted_points: wp.array2d(dtype=wp.vec3),
@@ -220,11 +219,11 @@ def _find_fronts(
             else:
                 side_of_body = float(1.0)
                 if body_sides:
-                    body = value_of_span(body_of_span, span_of_receiver(spans, receiver))
+                    body = value_of_receiver(body_of_span, spans, receiver)
                     side_of_body = body_sides[instance_in(batch, body_sides.shape[0]), body, plane]
                 front = _front_by_height(height, margin, side_of_body, wp.dot(normal, plane_normal))
             relative_height = height / (2.0 * _LIFT_IN_MARGINS * margin)
-            if plane != skip and wp.abs(relative_height) < 1.0:
+            if plane != self_plane and wp.abs(relative_height) < 1.0:
                 nearness = 1.0 - relative_height * relative_height
                 lift = (2.0 * front - 1.0) * nearness * nearness * _LIFT_IN_MARGINS * margin
                 offset += lift * wp.length(axis_u) * plane_normal
@@ -248,7 +247,7 @@ def find_fronts(
     planes: PlaneBlockers,
     *,
     spans: Sequence[Span] = (),
-    skip: int | None = None,
+    self_plane: int | None = None,
 ) -> PlaneFronts:
     """Weight of each plane's front for each receiver, and receivers lifted off planes in which they lie.
 
@@ -260,7 +259,7 @@ def find_fronts(
         frames: Where the planes are, vec3 of shape [batch, 3 · plane], from :meth:`.PlaneBlockers.frames`. Any batch
             may be 1.
         spans: Of the receivers, which know their body; () for those of body 0.
-        skip: Number of the plane that the receivers are part of, off which none is lifted; None for none.
+        self_plane: Number of the plane that the receivers are part of, off which none is lifted; None for none.
     Differentiable: points, normals, body_sides, centers and radii of spheres, frames.
     """
     centers, radii, blocker_indices = (None, None, None) if spheres is None else spheres
@@ -272,8 +271,13 @@ def find_fronts(
     shape = common_batch({**arguments, "body_sides": body_sides}), points.shape[1]
     front_weights = empty((*shape, planes.count), dtype=wp.float32, device=points.device)
     lifted_points = empty(shape, dtype=wp.vec3, device=points.device)
-    of_spans = receiver_spans(spans, points.shape[1], 1, points.device)
+    kernel_spans = receiver_spans(spans, points.shape[1], 1, points.device)
     bodies = span_values([span.body for span in spans] or [0], points.device)
-    inputs = [points, normals, body_sides, of_spans, bodies, centers, radii, blocker_indices, frames, planes.grids]
-    launch(_find_fronts, shape, inputs=[*inputs, -1 if skip is None else skip], outputs=[front_weights, lifted_points])
+    inputs = [points, normals, body_sides, kernel_spans, bodies, centers, radii, blocker_indices, frames, planes.grids]
+    launch(
+        _find_fronts,
+        shape,
+        inputs=[*inputs, -1 if self_plane is None else self_plane],
+        outputs=[front_weights, lifted_points],
+    )
     return PlaneFronts(front_weights, lifted_points)

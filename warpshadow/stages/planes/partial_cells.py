@@ -55,7 +55,7 @@ def _sample_weight(planes: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
     weight = wp.where(cosine > 0.0, 1.0, 0.0)
     if wp.length_sq(normal) == 0.0:
         weight = 1.0
-    elif planes.skip >= 0:
+    elif planes.self_plane >= 0:
         weight = wp.max(cosine, 0.0)
     return weight
 
@@ -182,12 +182,12 @@ def coverage_of_light(
     *,
     horizon_normals: wp.array | None = None,
     front_weights: wp.array | None = None,
-    skip: int | None = None,
+    self_plane: int | None = None,
 ) -> wp.array:
     """Coverage of the light of cells, C′: more exact than that of cells where planes cover them in part.
 
     Args:
-        points, frames, planes, directions, horizon_normals, front_weights, skip: As for
+        points, frames, planes, directions, horizon_normals, front_weights, self_plane: As for
             :func:`.coverage.plane_coverage`.
         covered: Its result, (C, μ), vec4 of shape [batch, receiver, direction].
         samples: Eight directions drawn from the light of each cell, NumPy of shape [direction, 8, 3].
@@ -197,12 +197,12 @@ def coverage_of_light(
     and how much directions count for receivers in a plane.
     """
     check.shape("samples", samples.shape, (len(directions), SAMPLES, 3))
-    check_planes(planes, points, frames, directions, skip)
+    check_planes(planes, points, frames, directions, self_plane)
     check.shape("covered", covered.shape, ("batch", points.shape[1], len(directions)))
     count = common_batch({"points": points, "frames": frames, "front_weights": front_weights, "covered": covered})
     points, covered = expand(points, count), expand_rows(covered, count)
     front_weights = None if front_weights is None else expand_rows(front_weights, count)
-    arrays = plane_arrays(planes, cell_radius(SAMPLES * len(directions)), skip)
+    arrays = plane_arrays(planes, cell_radius(SAMPLES * len(directions)), self_plane)
     samples_on_device = constant(np.asarray(samples, np.float32), wp.vec3, points.device)
     inputs = [plane_inputs(points, frames, front_weights, arrays), horizon_normals, covered, samples_on_device]
     return launch_with_adjoint(

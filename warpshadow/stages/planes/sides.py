@@ -252,7 +252,7 @@ def prepare_receiver(
     planes = inputs.planes
     frame_batch = instance_in(batch, inputs.frames.shape[0])
     for plane in range(planes.grids.shape[0]):
-        if plane != planes.skip:
+        if plane != planes.self_plane:
             local_receiver = find_local_receiver(inputs.points[batch, index], inputs.frames[frame_batch], plane)
             if wp.length_sq(local_receiver.normal) > 0.0:
                 # below the plane the front fades, and the back takes over
@@ -314,7 +314,7 @@ def visible_cell(planes: PlaneArrays, normal: wp.vec3, direction: wp.vec3):
     cell.direction = direction
     cell.radius = planes.radius
     cosine = wp.dot(normal, direction)
-    if planes.skip >= 0 and cosine > 0.0 and cosine < planes.radius:
+    if planes.self_plane >= 0 and cosine > 0.0 and cosine < planes.radius:
         cell.direction = wp.normalize(direction + (0.5 * (planes.radius - cosine)) * (normal - cosine * direction))
         cell.radius = 0.5 * (planes.radius + cosine)
     return cell

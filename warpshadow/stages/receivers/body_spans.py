@@ -1,6 +1,7 @@
 """Body spans: consecutive receivers of one body, by which one launch serves receivers of many bodies.
 
-A block of receivers lies in one span. Kernels leave out the body's own blockers, or read its table.
+A block of receivers lies in one span. Its number leads a kernel to the body's own blockers, which block none of its
+light, or to its table.
 """
 
 import functools
@@ -20,7 +21,7 @@ from warpshadow.device.warp_internals import struct_of
 
 
 class Span(NamedTuple):
-    """Consecutive receivers of one body; body −1 has receivers whose body is not told apart."""
+    """Consecutive receivers of one body; −1 for receivers of bodies that are not distinct."""
 
     body: int
     first: int
@@ -41,34 +42,34 @@ def relative_spans(spans: Sequence[Span]) -> tuple[Span, ...]:
 
 @wp.struct
 class ReceiverSpans:
-    """Spans that follow each other; no arrays for one of all receivers. Their last item is the end of the last span."""
+    """Consecutive spans of an instance. One span of all receivers has empty arrays."""
 
     receiver_count: int
     block_count: int  # of an instance
-    first_receivers: wp.array(dtype=wp.int32)  # [span + 1]
-    first_blocks: wp.array(dtype=wp.int32)  # [span + 1], of an instance
+    first_receivers: wp.array(dtype=wp.int32)  # [span + 1], the last is the end
+    first_blocks: wp.array(dtype=wp.int32)  # likewise
 
 
 @wp.struct
 class SpanValues:
     """A number of each span."""
 
-    single: int  # where there is no array, that of all receivers
+    single: int  # of all receivers, read where ``values`` is empty
     values: wp.array(dtype=wp.int32)  # [span]
 
 
 @wp.struct
 class ReceiverBlock:
-    """A block of receivers: its instance, its span with the receivers there, and its number among their blocks.
+    """A block of receivers: as many as a thread has lanes, of one span.
 
-    With one lane, receivers and the number are among all of the instance.
+    With one lane, :attr:`first`, :attr:`end` and :attr:`number` are of all receivers of the instance.
     """
 
     batch: int
     span: int
-    first: int
+    first: int  # receiver of the span
     end: int
-    number: int
+    number: int  # of the block among those of the span
 
 
 @functools.cache
@@ -94,15 +95,6 @@ def make_find_span(lanes: int) -> wp.Function:
 
 
 @wp.func
-def span_of_receiver(spans: ReceiverSpans, receiver: int):
-    """The span of a receiver of any instance."""
-    span = int(0)
-    if spans.first_receivers:
-        span = wp.lower_bound(spans.first_receivers, receiver + 1) - 1
-    return span
-
-
-@wp.func
 def value_of_span(values: SpanValues, span: int):
     """The number of a span."""
     value = values.single
@@ -111,12 +103,21 @@ def value_of_span(values: SpanValues, span: int):
     return value
 
 
+@wp.func
+def value_of_receiver(values: SpanValues, spans: ReceiverSpans, receiver: int):
+    """The number of the span in which a receiver of any instance is."""
+    value = values.single
+    if values.values:
+        value = values.values[wp.lower_bound(spans.first_receivers, receiver + 1) - 1]
+    return value
+
+
 def receiver_spans(spans: Sequence[Span], receiver_count: int, lanes: int, device: wp.Device) -> ReceiverSpans:
     """Cut spans into blocks.
 
     Args:
-        spans: Of all receivers, in their order; () for one of all.
-        receiver_count: Number of receivers.
+        spans: Of the receivers of an instance, consecutive; () for one of all.
+        receiver_count: Number of receivers of an instance.
         lanes: Receivers of a block.
     """
     ends = [span.end for span in spans] or [receiver_count]
@@ -133,7 +134,7 @@ def receiver_spans(spans: Sequence[Span], receiver_count: int, lanes: int, devic
 
 
 def span_values(values: Sequence[int], device: wp.Device) -> SpanValues:
-    """Give numbers of spans to a device."""
+    """Copy a number of each span to a device."""
     return struct_of(SpanValues, single=values[0], values=_put(values if len(values) > 1 else [], device))
 
 
@@ -160,7 +161,7 @@ def _write_numbers(
 
 
 def _put(numbers: Sequence[int], device: wp.Device) -> wp.array:
-    """Give numbers to a device. A graph gets them as arguments of launches: it has other receivers than plain calls."""
+    """Copy numbers to a device. While a graph is captured nothing may be: it gets them as arguments of launches."""
     if not numbers:
         return _no_numbers(device.alias)
     if not device.is_capturing:

@@ -46,7 +46,7 @@ class Receivers(NamedTuple):
     receiver_of_vertex: wp.array  # [vertex, then their backs if fragments have sides] int32, receiver or -1 for none
     fragments: Fragments  # of these faces
     static_vertices: np.ndarray = np.empty(0, int)  # [static vertex], the vertices that the first receivers are
-    spans: tuple[Span, ...] = ()  # of the others, where bodies are told apart; else ()
+    spans: tuple[Span, ...] = ()  # of the others, by body; () where no body is distinct
     vertices: wp.array | None = None  # int32, the vertex or back of each vertex receiver, [vertex receiver]
     sample_fragments: Fragments | None = None  # side and barycentrics of each sample receiver, [batch, sample receiver]
     samples: wp.array | None = None  # [view, sample receiver] int32, the sample that owns each, −1 for none
@@ -175,7 +175,7 @@ class Numbering(NamedTuple):
     vertices: wp.array | None
     static_vertices: np.ndarray  # [static vertex], the receivers on static bodies, which come first
     receiver_of_vertex: wp.array  # [vertex, and their backs] int32, -1 for none
-    spans: tuple[Span, ...] = ()  # of receivers not on static bodies, where bodies are told apart
+    spans: tuple[Span, ...] = ()  # of receivers not on static bodies, by body; () where no body is distinct
 
     @property
     def moving_count(self) -> int:
@@ -203,8 +203,8 @@ def number_receivers(
         is_static: Vertices of static bodies, bool of shape [vertex]; None if there are none.
         sequence: All vertices in the sequence in which they become receivers, shape [vertex]: light is found fastest
             where neighbors follow each other. None for the mesh's.
-        bodies: Body of each vertex, −1 for vertices that need not be told apart, shape [vertex]: receivers of a body
-            then follow each other. None where none need be told apart.
+        bodies: Body of each vertex, −1 where it is not distinct, shape [vertex]: receivers of a body
+            then follow each other. None where no body is distinct.
         device: Where they are.
     """
     side_count, vertex_count = keeps_vertex.shape
@@ -267,8 +267,8 @@ def find_receivers(
         numbering: The vertices that are receivers: those of faces that a sample sees, unless the face wants samples;
             with their backs where fragments have sides.
         has_sample_receivers: Faces whose samples have receivers of their own, bool of shape [face].
-        bodies: Body of each face, −1 for faces that need not be told apart, shape [face]; None where all share their
-            blockers, as for :func:`number_receivers`.
+        bodies: Body of each face, −1 where it is not distinct, shape [face]; None where no body is, as for
+            :func:`number_receivers`.
         supersampling: Samples of a pixel across and down: samples of a pixel with the same face share a receiver.
         quadtree: Squares in which samples of faces that want them interpolate; None for none.
         smooth_pieces: Smooth piece of each face, int32 of shape [face], where samples that see different faces of one
@@ -399,8 +399,8 @@ def receivers_on_faces(
         faces: Vertex indices, vec3i of shape [face].
         sides: Faces, from the front or from behind, int of shape [receiver].
         barycentrics: Where on them, shape [receiver, 3].
-        bodies: Body of each, −1 for receivers that need not be told apart, shape [receiver], runs of the same one after
-            another. None where none need be told apart.
+        bodies: Body of each, −1 where it is not distinct, shape [receiver]: those of a body follow each other. None
+            where no body is distinct.
     Differentiable: positions, normals.
     """
     device = positions.device

@@ -225,7 +225,7 @@ def find_sample_receivers(
         fragments: Sides that samples see, and barycentrics.
         side_count: Faces that receivers at vertices have.
         has_sample_receivers: Faces whose samples have receivers, bool of shape [face].
-        bodies: Body of each face, −1 for faces that need not be told apart, shape [face].
+        bodies: Body of each face, −1 where it is not distinct, shape [face].
         quadtree: Squares at whose corners there are receivers; None for none.
         surface: Visible surface of one instance, where samples of a pixel share a receiver if they see different faces
             of one smooth surface, too; None where they do not.

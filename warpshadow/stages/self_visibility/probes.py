@@ -22,9 +22,8 @@ from warpshadow.stages.receivers.body_spans import (
     Span,
     SpanValues,
     receiver_spans,
-    span_of_receiver,
     span_values,
-    value_of_span,
+    value_of_receiver,
 )
 
 _EVEN_FACES = 10_000
@@ -178,7 +177,7 @@ def _cut_faces(
 
 @wp.struct
 class ProbeTable:
-    """By which receivers of a body find their probes."""
+    """Pieces of the faces of one body, and where its vertices, faces and probes begin."""
 
     first_vertex: int  # of the body's vertices among all
     first_face: int  # likewise of its faces
@@ -200,7 +199,7 @@ def _find_vertex_weights(
 ):
     """A thread owns a receiver at a vertex."""
     receiver = wp.tid()
-    table = tables[value_of_span(table_of_span, span_of_receiver(spans, receiver))]
+    table = tables[value_of_receiver(table_of_span, spans, receiver)]
     vertex, is_back = split_side(vertices[receiver], vertex_count)
     row = vertex - table.first_vertex + wp.where(is_back, table.probe_count, 0)
     rows[0, receiver] = wp.vec3i(row, row, row)
@@ -263,7 +262,7 @@ def _find_sample_weights(
 ):
     """A thread owns a receiver at a fragment, −1 for none."""
     batch, receiver = wp.tid()
-    table = tables[value_of_span(table_of_span, span_of_receiver(spans, receiver))]
+    table = tables[value_of_receiver(table_of_span, spans, receiver)]
     face, is_back = split_side(wp.max(sides[batch, receiver], table.first_face), face_count)
     corners, piece_weights = _find_piece(table.pieces, face - table.first_face, barycentrics[batch, receiver])
     back_offset = wp.where(is_back, table.probe_count, 0)
@@ -272,7 +271,7 @@ def _find_sample_weights(
 
 
 class ProbeTables(NamedTuple):
-    """By which receivers of some bodies find their probes."""
+    """Tables of some bodies, in which their receivers find the probes around them."""
 
     tables: tuple[ProbeTable, ...]  # of each body
     table: wp.array  # the same on the device
@@ -301,9 +300,10 @@ class ProbeTables(NamedTuple):
     def of_vertices(
         self, vertices: wp.array, spans: Sequence[Span] = (), table_of_span: Sequence[int] = (0,)
     ) -> ProbeWeights:
-        """Weights of vertices and their backs, int32 of shape [receiver], indices among all vertices: batch 1.
+        """Probe weights of receivers at vertices, of batch 1.
 
         Args:
+            vertices: Indices among all vertices, after which their backs are numbered, int32 of shape [receiver].
             spans: Of the receivers, by body; () for one of all.
             table_of_span: The number of each span's body among those of the tables.
         """

@@ -26,7 +26,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, span_count
+from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, sector_count
 from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, run_dimensions, scratch_slot, split_launch
@@ -65,7 +65,7 @@ _LAUNCH_BOUNDS = 256, 3
 
 @functools.cache
 def _task_type(lanes: int) -> Any:
-    """Struct of a thread's work: a span of bundles of directions."""
+    """Struct of a thread's work: a sector of directions."""
     Lane = lane_type(lanes)
 
     @wp.struct
@@ -89,7 +89,7 @@ def _make_load_task(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.F
     @wp.func(inline=lanes == 1)
     def load_task(
         row: int,
-        span: int,
+        sector: int,
         worker: int,
         inputs: TraversalInputs,
         cells: DirectionCells,
@@ -103,9 +103,9 @@ def _make_load_task(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.F
             for direction in range(cells.directions.shape[0]):
                 receivers.footprints += wp.abs(dot_direction(cells.directions[direction], footprints))
             receivers.footprints = receivers.footprints / float(cells.directions.shape[0])
-        slot = scratch_slot(worker, row * all_stops.shape[1] + span)
-        stops = all_stops[row, span]
-        task = TransmittanceTask(cells, span * stops.shape[0], stops, reached_bundles[slot], scratch[slot])
+        slot = scratch_slot(worker, row * all_stops.shape[1] + sector)
+        stops = all_stops[row, sector]
+        task = TransmittanceTask(cells, sector * stops.shape[0], stops, reached_bundles[slot], scratch[slot])
         return block, receivers, task
 
     return load_task
@@ -183,10 +183,10 @@ def _make_transmit(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.Ke
         all_stops: wp.array3d(dtype=wp.int32),
         transmittance: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a block of receivers and a span of bundles; stops are the spheres where it stopped looking."""
+        """A thread owns a block of receivers and a sector of directions; stops are spheres where it stopped looking."""
         i, j = wp.tid()
-        span, row = split_launch(worker, first_row + i, j)
-        block, receivers, task = load_task(row, span, worker, inputs, cells, all_stops, scratch, reached_bundles)
+        sector, row = split_launch(worker, first_row + i, j)
+        block, receivers, task = load_task(row, sector, worker, inputs, cells, all_stops, scratch, reached_bundles)
         for bundle in range(task.stops.shape[0]):
             for cell in range(BUNDLE):
                 task.transmittances[bundle * BUNDLE + cell] = Lane(1.0)
@@ -253,10 +253,10 @@ def _make_transmit_adjoint(has_horizon: bool, has_footprints: bool, lanes: int) 
         adj_radii: wp.array2d(dtype=wp.float32),
         adj_extents: wp.array2d(dtype=wp.float32),
     ):
-        """A thread owns a block of receivers and a span of bundles."""
+        """A thread owns a block of receivers and a sector of directions."""
         i, j = wp.tid()
-        span, row = split_launch(worker, first_row + i, j)
-        block, receivers, task = load_task(row, span, worker, inputs, cells, all_stops, scratch, reached_bundles)
+        sector, row = split_launch(worker, first_row + i, j)
+        block, receivers, task = load_task(row, sector, worker, inputs, cells, all_stops, scratch, reached_bundles)
         first_direction, count = task.first_bundle * BUNDLE, task.stops.shape[0] * BUNDLE
         rows = transmittance[block.batch][block.first : block.end]
         adj_rows = adj_transmittance[block.batch][block.first : block.end]
@@ -319,14 +319,14 @@ def transmittance(
         check.shape("footprints", footprints.shape, points.shape)
         inputs.footprints = footprints
     device, traits = points.device, (normals is not None, footprints is not None, lanes)
-    spans = span_count(device, len(directions))
-    bundle_count = len(directions) // (BUNDLE * spans)
-    stops = empty((row_count, spans, bundle_count), dtype=wp.int32, device=device)
+    sectors = sector_count(device, len(directions))
+    bundle_count = len(directions) // (BUNDLE * sectors)
+    stops = empty((row_count, sectors, bundle_count), dtype=wp.int32, device=device)
     result = empty((*points.shape, len(directions)), dtype=wp.float32, device=device)
     return launch_with_adjoint(
         _make_transmit(*traits),
         lambda: _make_transmit_adjoint(*traits),
-        run_dimensions(device, row_count, spans),
+        run_dimensions(device, row_count, sectors),
         inputs=[inputs, cells],
         result=result,
         variables=[points],
