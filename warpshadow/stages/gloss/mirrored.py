@@ -5,7 +5,7 @@ the mean radiance R̄ of the receiver's blockers the point adds
 
     M = (1 − T) (m F L' + (1 − m) B − R̄),   F = a + (1 − a) (1 − |n·l|)⁵,
 
-m how metallic it is, a its albedo, B the radiosity of its side of the face, and L' the radiance from l': R̄ where that
+m how metallic it is, a its albedo, B the radiosity there (:mod:`warpshadow.stages.planes.face_texels`), and L' the radiance from l': R̄ where that
 ray meets a body, 0 where it leaves below the face that it starts on (:mod:`.lobe_hits`), else L, light without shadows,
 blurred by σ'² = σ² + 2 α²: σ is the blur of the sample (:mod:`.lobes`), √2 α that of a whole lobe, seen from above.
 Where l itself leaves below the receiver's face, M = −(1 − T) R̄. Where light bounces along paths, B is R̄.
@@ -20,6 +20,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 from warpshadow.stages.gloss.lobe_hits import LEAVES_BELOW, MEETS_SKY, LobeHits
 from warpshadow.stages.gloss.lobes import MIN_ROUGHNESS
+from warpshadow.stages.planes.face_texels import FaceTexels, radiosity_at
 from warpshadow.stages.raster.interpolation import interpolate_at
 
 _COST = 20.0  # nanoseconds that a sample takes
@@ -117,6 +118,7 @@ def _mix_mirrored(
     mean_radiance: wp.array2d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
     radiosity: wp.array2d(dtype=wp.vec3),
+    texels: FaceTexels,
     # out
     radiance: wp.array3d(dtype=wp.vec3),
 ):
@@ -144,7 +146,7 @@ def _mix_mirrored(
         fresnel = color + fresnel_weight * (wp.vec3(1.0) - color)
         diffuse = mean
         if radiosity:
-            diffuse = radiosity[instance_in(batch, radiosity.shape[0]), face]
+            diffuse = radiosity_at(radiosity[instance_in(batch, radiosity.shape[0])], texels, faces, face, weights)
         result = blocked * (metal_share * wp.cw_mul(fresnel, seen) + (1.0 - metal_share) * diffuse - mean)
     radiance[batch, receiver, sample] = result
 
@@ -159,6 +161,7 @@ def mix_mirrored(
     mean_radiance: wp.array,
     transmittance: wp.array,
     radiosity: wp.array | None = None,
+    texels: "FaceTexels | None" = None,
 ) -> wp.array:
     """Mix the radiance M that bodies add to the mean radiance of blockers in each sample.
 
@@ -169,8 +172,10 @@ def mix_mirrored(
         light: L, vec3 of shape [batch, receiver, sample].
         mean_radiance: R̄, of :func:`.reflection.find_blocked_radiance`, vec3 of shape [batch, receiver].
         transmittance: T, float32 of shape [batch, receiver, sample].
-        radiosity: B, of the sides of faces, vec3 of shape [batch, 2 · face]; None for R̄.
+        radiosity: B, of the texels of flat bodies and of the sides of faces, vec3 of shape [batch, texel + 2 · face];
+            None for R̄.
             Any batch may be 1 and then serves every instance.
+        texels: Where the faces of flat bodies are on these texels; None where no body is flat.
 
     Returns:
         Vec3 of shape [batch, receiver, sample].
@@ -184,7 +189,7 @@ def mix_mirrored(
     launch(
         _mix_mirrored,
         (shape[0] * shape[1], shape[2]),
-        inputs=[hits.face_ids, hits.barycentrics, hits.last_rays, faces, *values.values()],
+        inputs=[hits.face_ids, hits.barycentrics, hits.last_rays, faces, *values.values(), texels or FaceTexels()],
         outputs=[radiance],
         shared=[
             albedo,
