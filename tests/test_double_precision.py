@@ -775,6 +775,10 @@ def test_gradients_of_transmittance_of_lobes_are_exact(double, device, check, gl
     check(lambda *arguments: module.interpolate_transmittance(*arguments, cells), *arguments)
 
 
+def test_gradients_of_sharp_transmittance_are_exact(double, check):
+    check(double("stages.gloss.transmittance").sharpen, (wp.float64, np.abs(random(3, 2, 3, 4))))
+
+
 def test_gradients_of_weights_above_faces_are_exact(double, device, check):
     """Of samples above their face, on its edge of light, and below it; on either side."""
     module = double("stages.gloss.face_horizon")

@@ -14,10 +14,14 @@ from warpshadow.pipeline.shading.projected_cells import ProjectedCells
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis
 from warpshadow.stages.gloss.reflection import find_blocked_radiance
 from warpshadow.stages.gloss.suns import find_sun_transmittance
-from warpshadow.stages.gloss.transmittance import interpolate_transmittance
+from warpshadow.stages.gloss.transmittance import interpolate_transmittance, sharpen
 from warpshadow.stages.light.shading import shade
 from warpshadow.stages.light.transfer import directional_transfer
 from warpshadow.stages.receivers.find import Receivers
+
+_SAMPLES_OF_METAL = 64
+"""Samples of the lobes of a pixel where a body is of metal, all of whose light is in them: with 32, a bear of roughness
+0.35 and 0.6 is 7.5 and 7.7 in place of 6.8 and 6.0% off in direct light."""
 
 
 class CellLobes(LobeVisibility):
@@ -31,6 +35,8 @@ class CellLobes(LobeVisibility):
     def __init__(self, method: CellMethod, middles: np.ndarray):
         super().__init__(method.merged_scene, method.light, shares_receivers=method.shares_lobes)
         self._method, self._middles = method, middles
+        if any(np.any(body.metallic) for body in self._merged_scene.scene.bodies):
+            self.sample_count = _SAMPLES_OF_METAL
 
     def _cells(self, lobes: LitLobes) -> tuple[Node, Node, Node | ProjectedCells]:
         """Nodes of the transmittance of cells and of their receivers, and the projected light that says which cells.
@@ -87,7 +93,8 @@ def _interpolate(
 ) -> wp.array:
     if not directions.size:
         return wp.empty(directions.shape, dtype=wp.float32, device=directions.device)
-    return interpolate_transmittance(transmittance, receivers.normals, directions, projected_light.cosine_directions)
+    cells = projected_light.cosine_directions
+    return sharpen(interpolate_transmittance(transmittance, receivers.normals, directions, cells))
 
 
 def _find_sun_transmittance(
