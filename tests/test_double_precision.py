@@ -853,6 +853,32 @@ def test_gradients_of_the_light_of_mirrored_bodies_are_exact(quantity, double, d
     check(mix, scalars[0], *samples, (wp.vec3d, random(6, 1, 4, 3)), scalars[1], *blockers)
 
 
+def test_gradients_of_the_radiosity_of_mirrored_planes_are_exact(double, planes, device, check):
+    """Of the front of a ground, and of both sides of a wall."""
+    module, texels = double("stages.gloss.mirrored"), double("stages.planes.face_texels")
+    square, faces = np.array([[-2.0, 0, -2], [-2, 0, 2], [2, 0, 2], [2, 0, -2]]), np.int32([[0, 1, 2], [0, 2, 3]])
+    bodies = [texels.PlaneBody(None, square, faces, 4 * number, 0, True) for number in range(2)]
+    grid = double("stages.planes.grid").find_grid(square, faces, is_two_sided=False)[0]
+    of_faces = texels.find_face_texels(planes, [body._replace(grid=grid) for body in bodies], [0, 2], 4, 8)
+    sides = np.int32([[[0, 3, 7]]])
+    dtypes = wp.int32, wp.vec3d, wp.vec3d, wp.int32, wp.vec3d
+    hits = sides, np.array([[[[0.3, 0.5, 0.2], [0.1, 0.3, 0.6], [0.4, 0.35, 0.25]]]]), np.zeros((1, 1, 3, 3))
+    hits = double("stages.gloss.lobe_hits").LobeHits(
+        *(put(v, t, device) for v, t in zip((*hits, 1 + 0 * sides, hits[2]), dtypes, strict=True))
+    )
+    all_faces = put(np.concatenate([faces, faces + 4] * 2), wp.vec3i, device)
+    constants = put(random(0, 1, 8, 3), wp.vec3d, device), put(np.zeros((1, 8)), wp.float64, device)
+    filters, light, mean = (put(random(seed, 1, 1, 3, 3), wp.vec3d, device) for seed in (1, 2, 3))
+    share = put(np.array([[[0.1, 0.3, 0.6]]]), wp.float64, device)
+
+    def mix(radiosity):
+        rest = filters, light, mean.reshape((1, 3))[:, :1].contiguous(), share, radiosity, of_faces
+        return module.mix_mirrored(hits, all_faces, *constants, *rest)
+
+    texel_count = planes.texels_of_patches.shape[0]
+    check(mix, (wp.vec3d, random(4, 1, texel_count + 8, 3)))
+
+
 def test_gradients_of_radiance_of_blockers_are_exact(double, device, check):
     blocked = double("stages.gloss.reflection").find_blocked_radiance
     direct, openness = random(0, 1, 3, 3), np.repeat(np.linspace(0, 0.9, 3)[None, :, None], 3, axis=2)

@@ -24,7 +24,7 @@ from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
 from warpshadow.stages.bounces.radiosity import mean_over_patch_samples
 from warpshadow.stages.patches import MAX_PATCHES, SAMPLES_PER_PATCH, Patches, find_patches, find_plane_patches
-from warpshadow.stages.planes.face_texels import FaceTexels, find_face_texels
+from warpshadow.stages.planes.face_texels import FaceTexels, find_face_texels, no_face_texels
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
 from warpshadow.stages.receivers.find import Receivers, receivers_on_faces
 from warpshadow.stages.sparse import SparseMatrix, multiply
@@ -280,7 +280,7 @@ class Senders:
     def face_texels(self) -> FaceTexels:
         """Where the faces of flat bodies are on their grids."""
         if self.planes is None:
-            return FaceTexels()
+            return no_face_texels(self.merged_scene.device)
         merged_scene = self.merged_scene
         first_faces = merged_scene.first_face[[*self.planes.index_of_body]].tolist()
         counts = int(merged_scene.first_face[-1]), int(merged_scene.first_vertex[-1])

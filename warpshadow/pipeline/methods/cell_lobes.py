@@ -19,10 +19,6 @@ from warpshadow.stages.light.shading import shade
 from warpshadow.stages.light.transfer import directional_transfer
 from warpshadow.stages.receivers.find import Receivers
 
-_SAMPLES_OF_METAL = 64
-"""Samples of the lobes of a pixel where a body is of metal, all of whose light is in them: with 32, a bear of roughness
-0.35 and 0.6 is 7.5 and 7.7 in place of 6.8 and 6.0% off in direct light."""
-
 
 class CellLobes(LobeVisibility):
     """Visibility in lobes between cells.
@@ -35,8 +31,6 @@ class CellLobes(LobeVisibility):
     def __init__(self, method: CellMethod, middles: np.ndarray):
         super().__init__(method.merged_scene, method.light, shares_receivers=method.shares_lobes)
         self._method, self._middles = method, middles
-        if any(np.any(body.metallic) for body in self._merged_scene.scene.bodies):
-            self.sample_count = _SAMPLES_OF_METAL
 
     def _cells(self, lobes: LitLobes) -> tuple[Node, Node, Node | ProjectedCells]:
         """Nodes of the transmittance of cells and of their receivers, and the projected light that says which cells.

@@ -45,7 +45,12 @@ _CELL_ROWS = 64  # rows of the map of free light in cells: each pixel has the li
 
 
 def mix_gloss(
-    method: Method, lobes: LitLobes, diffuse: Node, materials: Materials, blocked: Node | None, radiosity: tuple[Node, FaceTexels] | None
+    method: Method,
+    lobes: LitLobes,
+    diffuse: Node,
+    materials: Materials,
+    blocked: Node | None,
+    radiosity: tuple[Node, FaceTexels] | None,
 ) -> tuple[Node, Node]:
     """Mix mirrored light with diffuse light, of all receivers of the view.
 

@@ -5,9 +5,10 @@ the mean radiance R̄ of the receiver's blockers the point adds
 
     M = (1 − T) (m F L' + (1 − m) B − R̄),   F = a + (1 − a) (1 − |n·l|)⁵,
 
-m how metallic it is, a its albedo, B the radiosity there (:mod:`warpshadow.stages.planes.face_texels`), and L' the radiance from l': R̄ where that
-ray meets a body, 0 where it leaves below the face that it starts on (:mod:`.lobe_hits`), else L, light without shadows,
-blurred by σ'² = σ² + 2 α²: σ is the blur of the sample (:mod:`.lobes`), √2 α that of a whole lobe, seen from above.
+m how metallic it is, a its albedo, B the radiosity there (:mod:`warpshadow.stages.planes.face_texels`), and L' the
+radiance from l': R̄ where that ray meets a body, 0 where it leaves below the face that it starts on
+(:mod:`.lobe_hits`), else L, light without shadows, blurred by σ'² = σ² + 2 α²: σ is the blur of the sample
+(:mod:`.lobes`), √2 α that of a whole lobe, seen from above.
 Where l itself leaves below the receiver's face, M = −(1 − T) R̄. Where light bounces along paths, B is R̄.
 """
 
@@ -20,7 +21,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 from warpshadow.stages.gloss.lobe_hits import LEAVES_BELOW, MEETS_SKY, LobeHits
 from warpshadow.stages.gloss.lobes import MIN_ROUGHNESS
-from warpshadow.stages.planes.face_texels import FaceTexels, radiosity_at
+from warpshadow.stages.planes.face_texels import FaceTexels, no_face_texels, radiosity_at
 from warpshadow.stages.raster.interpolation import interpolate_at
 
 _COST = 20.0  # nanoseconds that a sample takes
@@ -186,10 +187,11 @@ def mix_mirrored(
     values |= {"transmittance": transmittance, "radiosity": radiosity}
     shape = common_batch({"hits": hits.face_ids, **values}), *light.shape[1:]
     radiance = wp.empty(shape, dtype=wp.vec3, device=light.device)
+    texels = no_face_texels(light.device) if texels is None else texels
     launch(
         _mix_mirrored,
         (shape[0] * shape[1], shape[2]),
-        inputs=[hits.face_ids, hits.barycentrics, hits.last_rays, faces, *values.values(), texels or FaceTexels()],
+        inputs=[hits.face_ids, hits.barycentrics, hits.last_rays, faces, *values.values(), texels],
         outputs=[radiance],
         shared=[
             albedo,

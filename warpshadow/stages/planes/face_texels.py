@@ -12,7 +12,7 @@ import warp as wp
 
 from warpshadow.device.constants import constant
 from warpshadow.stages.planes.cells import PlaneArrays, PlaneFootprint, fetch, find_mip_footprint, plane_arrays
-from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody, PlaneGrid
 from warpshadow.stages.raster.interpolation import interpolate_at
 
 
@@ -44,6 +44,18 @@ def find_face_texels(
     texels, device = FaceTexels(), blockers.levels.device
     texels.planes = plane_arrays(blockers, 1.0, None)
     texels.plane_of_face, texels.points = constant(plane_of_face, wp.int32, device), constant(points, wp.vec3, device)
+    return texels
+
+
+def no_face_texels(device: wp.DeviceLike) -> FaceTexels:
+    """Those of a scene without flat bodies."""
+    texels, planes = FaceTexels(), PlaneArrays()
+    dtypes = {"grids": PlaneGrid, "levels": wp.vec3i, "level_scales": wp.vec2}
+    dtypes |= {"covered": wp.vec3, "edges": wp.vec4, "edge_axes": wp.vec2}
+    for name, dtype in dtypes.items():  # tapes ask all of them for gradients
+        setattr(planes, name, wp.empty(0, dtype=dtype, device=device))
+    texels.planes, texels.points = planes, wp.empty(0, dtype=wp.vec3, device=device)
+    texels.plane_of_face = wp.empty(0, dtype=wp.int32, device=device)
     return texels
 
 
