@@ -288,9 +288,9 @@ class Senders:
 
     @functools.cached_property
     def mean_over_surfaces(self) -> SparseMatrix:
-        """Weights of patches in the texels of flat bodies, and then in the sides of faces, by area.
+        """Weights of patches in the texels of flat bodies, and after these in the sides of faces, by area.
 
-        The shape is [texel + 2 · face, patch]; rows of what sends nothing are 0.
+        The shape is [texel + 2 · face, patch]; rows of black surfaces are 0.
         """
         from scipy.sparse import coo_matrix, diags, vstack
 

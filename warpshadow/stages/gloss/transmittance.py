@@ -251,14 +251,14 @@ def _sharpen(
     first_row: int,
     worker: int,
     # in
-    blurred: wp.array3d(dtype=wp.float32),
+    transmittance: wp.array3d(dtype=wp.float32),
     # out
     sharp: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a sample."""
     row, sample = wp.tid()
     batch, receiver = split_row(first_row + row, sharp.shape[1])
-    t = blurred[batch, receiver, sample]
+    t = transmittance[batch, receiver, sample]
     sharp[batch, receiver, sample] = t * t * (3.0 - 2.0 * t)
 
 

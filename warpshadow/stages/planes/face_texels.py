@@ -48,7 +48,7 @@ def find_face_texels(
 
 
 def no_face_texels(device: wp.DeviceLike) -> FaceTexels:
-    """Those of a scene without flat bodies."""
+    """Make the face texels of a scene without flat bodies."""
     texels, planes = FaceTexels(), PlaneArrays()
     dtypes = {"grids": PlaneGrid, "levels": wp.vec3i, "level_scales": wp.vec2}
     dtypes |= {"covered": wp.vec3, "edges": wp.vec4, "edge_axes": wp.vec2}
