@@ -801,6 +801,10 @@ def test_gradients_of_transmittance_of_lobes_are_exact(double, device, check, gl
     check(lambda *arguments: module.interpolate_transmittance(*arguments, cells), *arguments)
 
 
+def test_gradients_of_sharp_transmittance_are_exact(double, check):
+    check(double("stages.gloss.transmittance").sharpen, (wp.float64, np.abs(random(3, 2, 3, 4))))
+
+
 def test_gradients_of_weights_above_faces_are_exact(double, device, check):
     """Of samples above their face, on its edge of light, and below it; on either side."""
     module = double("stages.gloss.face_horizon")
@@ -873,6 +877,32 @@ def test_gradients_of_the_light_of_mirrored_bodies_are_exact(quantity, double, d
     samples = (wp.vec3d, unit(random(4, 1, 2, 3, 3))), (wp.float64, 0.2 + np.abs(random(5, 1, 2, 3)))
     blockers = (wp.vec3d, random(7, 1, 2, 3)), (wp.float64, random(8, 1, 2, 3)), (wp.vec3d, random(9, 1, 4, 3))
     check(mix, scalars[0], *samples, (wp.vec3d, random(6, 1, 4, 3)), scalars[1], *blockers)
+
+
+def test_gradients_of_the_radiosity_of_mirrored_planes_are_exact(double, planes, device, check):
+    """Of the front of a ground, and of both sides of a wall."""
+    module, texels = double("stages.gloss.mirrored"), double("stages.planes.face_texels")
+    square, faces = np.array([[-2.0, 0, -2], [-2, 0, 2], [2, 0, 2], [2, 0, -2]]), np.int32([[0, 1, 2], [0, 2, 3]])
+    bodies = [texels.PlaneBody(None, square, faces, 4 * number, 0, True) for number in range(2)]
+    grid = double("stages.planes.grid").find_grid(square, faces, is_two_sided=False)[0]
+    of_faces = texels.find_face_texels(planes, [body._replace(grid=grid) for body in bodies], [0, 2], 4, 8)
+    sides = np.int32([[[0, 3, 7]]])
+    dtypes = wp.int32, wp.vec3d, wp.vec3d, wp.int32, wp.vec3d
+    hits = sides, np.array([[[[0.3, 0.5, 0.2], [0.1, 0.3, 0.6], [0.4, 0.35, 0.25]]]]), np.zeros((1, 1, 3, 3))
+    hits = double("stages.gloss.lobe_hits").LobeHits(
+        *(put(v, t, device) for v, t in zip((*hits, 1 + 0 * sides, hits[2]), dtypes, strict=True))
+    )
+    all_faces = put(np.concatenate([faces, faces + 4] * 2), wp.vec3i, device)
+    constants = put(random(0, 1, 8, 3), wp.vec3d, device), put(np.zeros((1, 8)), wp.float64, device)
+    filters, light, mean = (put(random(seed, 1, 1, 3, 3), wp.vec3d, device) for seed in (1, 2, 3))
+    share = put(np.array([[[0.1, 0.3, 0.6]]]), wp.float64, device)
+
+    def mix(radiosity):
+        rest = filters, light, mean.reshape((1, 3))[:, :1].contiguous(), share, radiosity, of_faces
+        return module.mix_mirrored(hits, all_faces, *constants, *rest)
+
+    texel_count = planes.texels_of_patches.shape[0]
+    check(mix, (wp.vec3d, random(4, 1, texel_count + 8, 3)))
 
 
 def test_gradients_of_radiance_of_blockers_are_exact(double, device, check):

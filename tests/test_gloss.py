@@ -35,10 +35,6 @@ SUN = 0.06
 # Of metals that mirror each other: what they mirror is a constant of poses. Measured 22%, and 161% with outlines fixed.
 OF_METALS = 0.35
 
-# Of metals that mirror each other. As roughness turns samples, what these meet is a constant. Measured 11%, and 5%
-# where rays that leave below their face had light: they lose it at once as they turn.
-METALS_SMOOTH = {"albedo": SMOOTH, "metallic": SMOOTH, "roughness": 0.15}
-
 # Of a highlight that is a sample off a limb. Measured 18%, and 52% with mean slopes up to one sample from outlines.
 LIMB = 0.3
 
@@ -384,21 +380,35 @@ def test_a_metal_mirrors_a_red_and_a_blue_ball_each_in_its_place(render):
     assert red > 5 * blue
 
 
+@pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render()])
+def test_a_metal_mirrors_a_red_and_a_blue_part_of_a_floor_each_in_its_place(render):
+    """The floor is one face in each half of its texture, and its mean radiance is as red as blue."""
+    texture = np.repeat(np.array([[[0.8, 0.1, 0.1], [0.1, 0.1, 0.8]]], np.float32), 32, axis=1).repeat(64, axis=0)
+    floor = ws.Body(ws.plane(4.0), texture=texture, name="floor")
+    wall = ws.Body(ws.plane(4.0), (1, 1, 1), rotation=(90, 0, 0), translation=(0, 0, -2), roughness=0.1, metallic=1.0)
+    camera = ws.Camera.look_at((-1, 2, 2.5), (-1, 0.5, -2), fov_y=4, size=(8, 8))
+    image = render(ws.Scene([floor, wall], ws.EnvironmentMap.constant(1.0), camera, bounces=1))[..., :3]
+    red, _, blue = image.mean(axis=(0, 1))
+    assert red > 3 * blue
+
+
 def test_gradients_to_the_color_of_a_body_that_a_metal_mirrors_agree_with_differences():
     ball = ws.Body(METAL.mesh, (0.7, 0.5, 0.4), blockers=METAL.blockers, translation=(0.55, 0.5, 0))
     renderer = TorchRenderer(metal_scene(METALS[0], ball, GROUND), progress=False)
     value, image = torch.tensor([[0.7, 0.5, 0.4]]), weights()[:24, :24]
     gradient, difference = twins.slopes(lambda color: (renderer(albedo={1: color}).double() * image).sum(), value, 3e-3)
-    assert gradient == pytest.approx(difference, rel=METALS_SMOOTH["albedo"])
+    assert gradient == pytest.approx(difference, rel=SMOOTH)
 
 
-def test_one_convex_metal_takes_no_rays_for_metals_that_it_mirrors():
+def test_lobes_are_traced_where_metals_mirror_bodies():
+    """One convex metal alone mirrors none; nor do plastics."""
     torus = trimesh.creation.torus(0.4, 0.15)
     ring = dataclasses.replace(METALS[0], mesh=ws.Mesh(torus.vertices, torus.faces), blockers=16)
     plastic = dataclasses.replace(METALS[1], metallic=0.0)
     for bodies, traces in (
-        ((METALS[0], GROUND), False),
-        ((ring, GROUND), True),
+        ((METALS[0],), False),
+        ((METALS[0], GROUND), True),
+        ((ring,), True),
         ((*METALS, GROUND), True),
         ((METALS[0], plastic, GROUND), True),
         ((dataclasses.replace(ring, metallic=0.0), plastic, GROUND), False),
@@ -421,7 +431,7 @@ def test_metals_mirror_metals_where_poses_put_them():
     assert not torch.allclose(images[0], images[1], atol=0.1)
 
 
-@pytest.mark.parametrize("name", ["roughness", "metallic", "albedo"])
+@pytest.mark.parametrize("name", ["metallic", "albedo"])
 def test_gradients_to_metals_that_mirror_each_other_agree_with_differences(name):
     renderer, image = TorchRenderer(metal_scene(*METALS, GROUND), progress=False), weights()[:24, :24]
 
@@ -430,7 +440,20 @@ def test_gradients_to_metals_that_mirror_each_other_agree_with_differences(name)
 
     value = torch.tensor([[0.7, 0.5, 0.4]] if name == "albedo" else [0.4])
     gradient, difference = twins.slopes(loss, value, 3e-3)
-    assert gradient == pytest.approx(difference, rel=METALS_SMOOTH[name])
+    assert gradient == pytest.approx(difference, rel=SMOOTH)
+
+
+def test_gradients_to_the_roughness_of_metals_that_mirror_each_other_are_the_change_of_the_image():
+    """On average over a range: as samples turn, they leap from body to body, and differences by 30% with the step."""
+    renderer, image = TorchRenderer(metal_scene(*METALS, GROUND), progress=False), weights()[:24, :24]
+
+    def loss(value):
+        return (renderer(roughness={0: value, 1: value}).double() * image).sum()
+
+    values = (0.35 + 0.1 * (torch.arange(12) + 0.5) / 12).requires_grad_()
+    gradients = [float(torch.autograd.grad(loss(value), value)[0]) for value in values.split(1)]
+    change = float(loss(torch.tensor([0.45])) - loss(torch.tensor([0.35])))
+    assert 0.1 * np.mean(gradients) == pytest.approx(change, rel=0.06)  # measured 3.3%
 
 
 def test_gradients_to_poses_of_metals_are_about_the_change_of_the_image():
@@ -500,7 +523,8 @@ def test_gradients_to_a_pose_go_through_footprints_in_textures_of_gloss():
         shifts = torch.cat([torch.zeros(1, 3), value, torch.zeros(1, 3)])
         return (renderer(geometry=renderer.placed(rotations, translations + shifts, scales), **given) * image).sum()
 
-    gradient, difference = twins.slopes(loss, torch.zeros(1, 3), 1e-3)
+    # measured 0.5%; steps of 1e-3 go past bends of the loss, which is 9% off
+    gradient, difference = twins.slopes(loss, torch.zeros(1, 3), 1e-4)
     assert np.linalg.norm(gradient - difference) < SMOOTH * np.linalg.norm(difference)
 
 

@@ -31,6 +31,7 @@ from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.light.sums import add_light
+from warpshadow.stages.planes.face_texels import FaceTexels
 from warpshadow.stages.sparse import multiply
 
 if TYPE_CHECKING:  # they are imported where light bounces, or bodies shine
@@ -156,11 +157,14 @@ class LightTransport:
         selected_openness = None if openness is None else lobes.points.select(openness)
         return self.method.lobes.blocked_radiance(lobes, lobes.points.select(bounced), selected_openness)
 
-    def radiosity(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node | None:
-        """Radiosity of the sides of faces, where patches of known light or of moving bodies have it.
+    def radiosity(
+        self, points: ShadingContext, light: LightInput, materials: Materials
+    ) -> tuple[Node, FaceTexels] | None:
+        """Radiosity of surfaces, where patches of known light or of moving bodies have it.
 
         Returns:
-            Node of vec3 of shape [batch, 2 · face]; None where light does not bounce, or along paths, or where it is
+            Node of that of the texels of flat bodies and of the sides of faces, vec3 of shape [batch, texel +
+            2 · face], and where faces are on texels; None where light does not bounce, or along paths, or where it is
             free among static patches, of which only transfer is known.
         """
         senders = self._patches.senders(materials) if self.method.merged_scene.scene.bounces else None
@@ -174,7 +178,8 @@ class LightTransport:
             patch_radiosity = self._static_bounces.radiosity(at_patch_samples, points, materials)
         else:
             return None
-        return Node("", lambda radiosity: multiply(senders.mean_over_faces, radiosity), patch_radiosity)
+        surface_radiosity = Node("", lambda radiosity: multiply(senders.mean_over_surfaces, radiosity), patch_radiosity)
+        return surface_radiosity, senders.face_texels
 
     def _openness(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node | None:
         """Part of the hemispheres of points that no blocker takes, vec3 of shape [view, receiver].

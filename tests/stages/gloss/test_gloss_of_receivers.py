@@ -236,6 +236,14 @@ def test_transmittance_of_samples_is_the_mean_of_the_cells_around(device):
     assert np.abs(got - expected).max() < 20 * FLOAT32
 
 
+def test_sharp_transmittance_keeps_edges_in_their_places(device):
+    """None, half and all of it stay."""
+    blurred = np.linspace(0, 1, 9)
+    sharp = transmittance.sharpen(wp.array(blurred[None, None], dtype=wp.float32, device=device)).numpy()[0, 0]
+    np.testing.assert_allclose(sharp, blurred**2 * (3 - 2 * blurred), atol=FLOAT32)
+    np.testing.assert_array_equal(sharp[[0, 4, 8]], [0, 0.5, 1])
+
+
 def test_blockers_send_what_is_blocked(device):
     """Of even light that all bounces bring back, nothing is missing."""
     even = wp.full((1, 2), wp.vec3(0.7), dtype=wp.vec3, device=device)

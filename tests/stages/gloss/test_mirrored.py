@@ -26,7 +26,7 @@ def put(values, dtype, device):
     return wp.array(np.asarray(values), dtype=dtype, device=device)
 
 
-def hits_of(device, transmittance=0.0, points=POINTS, normals=UP, directions=DIRECTIONS, is_shown=(1, 1, 0, 0)):
+def hits_of(device, transmittance=0.0, points=POINTS, normals=UP, directions=DIRECTIONS, is_shown=(2, 2, 0, 0)):
     mesh = wp.Mesh(put(POSITIONS, wp.vec3, device), put(FACES.ravel(), wp.int32, device))
     arrays = [put(values, wp.vec3, device) for values in (NORMALS, points, normals, directions)]
     through = wp.full((2, 3), transmittance, dtype=wp.float32, device=device)

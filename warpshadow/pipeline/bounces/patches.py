@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -23,6 +24,8 @@ from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.stages.bounces.albedo import mean_over_texels, mean_over_vertices
 from warpshadow.stages.bounces.radiosity import mean_over_patch_samples
 from warpshadow.stages.patches import MAX_PATCHES, SAMPLES_PER_PATCH, Patches, find_patches, find_plane_patches
+from warpshadow.stages.planes.face_texels import FaceTexels, find_face_texels, no_face_texels
+from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
 from warpshadow.stages.receivers.find import Receivers, receivers_on_faces
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
@@ -201,6 +204,14 @@ class ScenePatches:
         return self._means[key]
 
 
+class SenderPlanes(NamedTuple):
+    """The flat bodies among senders."""
+
+    blockers: PlaneBlockers
+    index_of_body: dict[int, int]  # of each among them, by the number of the body
+    bodies: tuple[PlaneBody, ...]
+
+
 class Senders:
     """Bodies that send light, and their patches one after another.
 
@@ -248,9 +259,40 @@ class Senders:
         )
 
     @functools.cached_property
-    def mean_over_faces(self) -> SparseMatrix:
-        """Weights of patches in the sides of faces, by area: [2 · face, patch]; 0 of sides that send nothing."""
-        from scipy.sparse import coo_matrix, diags
+    def planes(self) -> SenderPlanes | None:
+        """The flat bodies among them; None without any."""
+        merged_scene = self.merged_scene
+        numbers = [number for number in self.bodies if merged_scene.is_flat[number]]
+        if not numbers:
+            return None
+        bodies = []
+        for number in numbers:
+            sender_index, body = self.bodies.index(number), merged_scene.scene.bodies[number]
+            grid = self.patches[sender_index].grid
+            assert grid is not None
+            starts = int(merged_scene.first_vertex[number]), int(self.first[sender_index])
+            bodies.append(PlaneBody(grid, body.mesh.positions, body.mesh.surface.faces, *starts, body.casts_shadow))
+        counts = len(self.areas), int(merged_scene.first_vertex[-1])
+        blockers = PlaneBlockers.from_bodies(bodies, *counts, device=merged_scene.device)
+        return SenderPlanes(blockers, {number: k for k, number in enumerate(numbers)}, tuple(bodies))
+
+    @functools.cached_property
+    def face_texels(self) -> FaceTexels:
+        """Where the faces of flat bodies are on their grids."""
+        if self.planes is None:
+            return no_face_texels(self.merged_scene.device)
+        merged_scene = self.merged_scene
+        first_faces = merged_scene.first_face[[*self.planes.index_of_body]].tolist()
+        counts = int(merged_scene.first_face[-1]), int(merged_scene.first_vertex[-1])
+        return find_face_texels(self.planes.blockers, self.planes.bodies, first_faces, *counts)
+
+    @functools.cached_property
+    def mean_over_surfaces(self) -> SparseMatrix:
+        """Weights of patches in the texels of flat bodies, and after these in the sides of faces, by area.
+
+        The shape is [texel + 2 · face, patch]; rows of black surfaces are 0.
+        """
+        from scipy.sparse import coo_matrix, diags, vstack
 
         merged_scene, entries = self.merged_scene, []
         for number, first, item in zip(self.bodies, self.first[:-1], self.patches, strict=True):
@@ -263,6 +305,9 @@ class Senders:
         areas, sides, owners = np.concatenate(entries, axis=1)
         shape = 2 * int(merged_scene.first_face[-1]), int(self.first[-1])
         matrix = coo_matrix((areas, (sides.astype(int), owners.astype(int))), shape).tocsr()
+        if self.planes is not None:
+            assert self.planes.blockers.texels_of_patches is not None
+            matrix = vstack([self.planes.blockers.texels_of_patches.to_scipy(), matrix]).tocsr()
         sums = np.maximum(matrix.sum(axis=1).A1, 1e-30)
         return SparseMatrix.from_matrix(diags(1 / sums) @ matrix, device=merged_scene.device)
 

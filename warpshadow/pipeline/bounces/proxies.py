@@ -12,7 +12,7 @@ import warp as wp
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
-from warpshadow.pipeline.bounces.patches import Senders
+from warpshadow.pipeline.bounces.patches import SenderPlanes, Senders
 from warpshadow.pipeline.bounces.scene_overlays import find_overlays
 from warpshadow.pipeline.shading.transfers import join_rows
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, tilt_normals_off_planes
@@ -20,17 +20,9 @@ from warpshadow.stages.bounces.proxies import find_depths, place_proxies
 from warpshadow.stages.bounces.proxy_radiance import patches_of_clusters
 from warpshadow.stages.bounces.tangent_planes import TangentPlanes, find_tangent_planes, find_tolerances
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts
-from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
-
-
-class SenderPlanes(NamedTuple):
-    """The flat bodies among senders."""
-
-    blockers: PlaneBlockers
-    index_of_body: dict[int, int]  # of each among them, by the number of the body
 
 
 class PlacedProxies(NamedTuple):
@@ -56,23 +48,10 @@ class Proxies:
     def __init__(self, senders: Senders, merging: float):
         self.senders, self.merged_scene, self.merging = senders, senders.merged_scene, merging
 
-    @functools.cached_property
+    @property
     def planes(self) -> SenderPlanes | None:
         """The flat bodies among them; None without any."""
-        merged_scene, senders = self.merged_scene, self.senders
-        numbers = [number for number in senders.bodies if merged_scene.is_flat[number]]
-        if not numbers:
-            return None
-        bodies = []
-        for number in numbers:
-            sender_index, body = senders.bodies.index(number), merged_scene.scene.bodies[number]
-            grid = senders.patches[sender_index].grid
-            assert grid is not None
-            starts = int(merged_scene.first_vertex[number]), int(senders.first[sender_index])
-            bodies.append(PlaneBody(grid, body.mesh.positions, body.mesh.surface.faces, *starts, body.casts_shadow))
-        counts = len(senders.areas), int(merged_scene.first_vertex[-1])
-        planes = PlaneBlockers.from_bodies(bodies, *counts, device=merged_scene.device)
-        return SenderPlanes(planes, {number: k for k, number in enumerate(numbers)})
+        return self.senders.planes
 
     @functools.cached_property
     def black_bodies(self) -> list[int]:

@@ -14,7 +14,7 @@ from warpshadow.pipeline.shading.projected_cells import ProjectedCells
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT, change_basis
 from warpshadow.stages.gloss.reflection import find_blocked_radiance
 from warpshadow.stages.gloss.suns import find_sun_transmittance
-from warpshadow.stages.gloss.transmittance import interpolate_transmittance
+from warpshadow.stages.gloss.transmittance import interpolate_transmittance, sharpen
 from warpshadow.stages.light.shading import shade
 from warpshadow.stages.light.transfer import directional_transfer
 from warpshadow.stages.receivers.find import Receivers
@@ -89,7 +89,8 @@ def _interpolate(
 ) -> wp.array:
     if not directions.size:
         return wp.empty(directions.shape, dtype=wp.float32, device=directions.device)
-    return interpolate_transmittance(transmittance, receivers.normals, directions, projected_light.cosine_directions)
+    cells = projected_light.cosine_directions
+    return sharpen(interpolate_transmittance(transmittance, receivers.normals, directions, cells))
 
 
 def _find_sun_transmittance(

@@ -30,6 +30,7 @@ from warpshadow.stages.gloss.prefilter import look_up_light, prefilter
 from warpshadow.stages.gloss.reflection import LobeLight, mix_reflection, sum_lobes
 from warpshadow.stages.gloss.suns import add_suns
 from warpshadow.stages.light.sums import add_light
+from warpshadow.stages.planes.face_texels import FaceTexels
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.find import Receivers
@@ -44,7 +45,12 @@ _CELL_ROWS = 64  # rows of the map of free light in cells: each pixel has the li
 
 
 def mix_gloss(
-    method: Method, lobes: LitLobes, diffuse: Node, materials: Materials, blocked: Node | None, radiosity: Node | None
+    method: Method,
+    lobes: LitLobes,
+    diffuse: Node,
+    materials: Materials,
+    blocked: Node | None,
+    radiosity: tuple[Node, FaceTexels] | None,
 ) -> tuple[Node, Node]:
     """Mix mirrored light with diffuse light, of all receivers of the view.
 
@@ -77,8 +83,9 @@ def mix_gloss(
     transmittance = visibility.transmittance(lobes, directions)
     mirrored: Node | None = None
     mirrored_bodies = method.mirrored_bodies
-    shown = mirrored_bodies.shown(mirrored_bodies.mirrors(materials), materials, radiosity)
-    if blocked is not None and shown:
+    find_shown = functools.partial(mirrored_bodies.shown, materials, have_radiosity=radiosity is not None)
+    shown = points.cached("bodies that lobes show", (materials, radiosity is None), find_shown)
+    if blocked is not None and any(shown):
         texels = texels if light.is_free else visibility.prefiltered(points, light, with_suns=True)
         look_up = functools.partial(_look_up, method, points, "", light, texels)
         mirrored = mirrored_bodies.radiance(

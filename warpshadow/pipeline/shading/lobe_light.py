@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import warp as wp
 
 from warpshadow.assets.known_light import KnownLight
@@ -40,7 +41,7 @@ class LobeVisibility:
     | :meth:`transmittance` | shadows in mirrored light | 1: no shadows |
     | :meth:`sun_transmittance` | suns | :meth:`transmittance` in :attr:`sun_sample_count` directions of each |
     | :meth:`blocked_radiance` | light that bounces | refused |
-    | :attr:`sample_count`, :attr:`sun_sample_count` | the noise of its shadows | 32; 1 |
+    | :attr:`sample_count`, of metals :attr:`metal_sample_count`; of suns :attr:`sun_sample_count` | noise | 32, 64; 1 |
 
     Args:
         merged_scene: The bodies.
@@ -51,6 +52,10 @@ class LobeVisibility:
     sample_count = 32
     """Samples of a lobe. Light without shadows, and without its suns, of an indoor map is 2.1% off with 32, 3.5% with
     16 (roughness 0.35)."""
+
+    metal_sample_count = 64
+    """Samples of a lobe where a body is of metal, all of whose light is in lobes: with 32, a bear of roughness 0.35 and
+    0.6 is 7.5 and 7.7 in place of 6.8 and 5.9% off in direct light."""
 
     sun_sample_count = 1  # directions in which each sun is looked for from the lobe of a receiver
 
@@ -66,7 +71,9 @@ class LobeVisibility:
     @property
     def samples_of_receiver(self) -> int:
         """Number of samples of the lobe of a receiver."""
-        return max(self.sample_count // self.receivers_across**2, min(self.sample_count, _MIN_SAMPLES))
+        is_metal = any(np.any(body.metallic) for body in self._merged_scene.scene.bodies)
+        count = max(self.sample_count, self.metal_sample_count if is_metal else 0)
+        return max(count // self.receivers_across**2, min(count, _MIN_SAMPLES))
 
     def _cached(self, name: str, points: ShadingContext, light: LightInput, make: Callable[[], Node]) -> Node:
         """A node of known light, cached for the scene's light and, with points, for the last other one."""

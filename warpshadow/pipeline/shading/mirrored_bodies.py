@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -21,9 +22,17 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node, detached, field_of
 from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
-from warpshadow.stages.gloss.lobe_hits import HIT_TYPES, LobeHits, trace_hits
+from warpshadow.stages.gloss.lobe_hits import HIT_TYPES, MIRRORS, SENDS, LobeHits, trace_hits
 from warpshadow.stages.gloss.mirrored import mirror, mix_mirrored
+from warpshadow.stages.planes.face_texels import FaceTexels
 from warpshadow.stages.receivers.find import Receivers
+
+
+class ShownBodies(NamedTuple):
+    """Bodies whose own light counts where lobes meet them, by number."""
+
+    mirrors: tuple[int, ...]  # metals
+    senders: tuple[int, ...]  # others, of which only their radiosity counts
 
 
 class MirroredBodies:
@@ -37,31 +46,30 @@ class MirroredBodies:
         self._merged_scene = merged_scene
         self._mesh: wp.Mesh | None = None
 
-    def mirrors(self, materials: Materials) -> tuple[int, ...]:
-        """Bodies that lobes may meet as metals, without textures: others shine, too, or they are not convex."""
-        bodies, is_glossy = self._merged_scene.scene.bodies, self._merged_scene.is_glossy
-        sizes_of = [textures.sizes for textures in materials.textures_of.values()]
-        is_untextured = np.all([[size is None for size in sizes] for sizes in sizes_of], axis=0)
-        return tuple(
-            number
-            for number in np.flatnonzero(is_glossy & is_untextured).tolist()
-            if materials.may_be_metal(number) and (is_glossy.sum() > 1 or not bodies[number].mesh.is_convex)
-        )
+    def shown(self, materials: Materials, *, have_radiosity: bool) -> ShownBodies:
+        """Find the bodies whose own light counts where lobes meet them.
 
-    def shown(self, mirrors: tuple[int, ...], materials: Materials, radiosity: Node | None) -> tuple[int, ...]:
-        """Bodies whose own light counts where lobes meet them: mirrors and, beside a metal, others with a radiosity.
+        Metals without textures mirror light: others shine, too, or they are not convex. Beside a metal, bodies that
+        are none show their radiosity.
 
-        Flat bodies keep the mean radiance of blockers: their faces may be as large as a room.
+        Args:
+            materials: Of the bodies.
+            have_radiosity: Whether their radiosity is known.
         """
-        is_flat, is_glossy = self._merged_scene.is_flat, self._merged_scene.is_glossy
-        metals = {n for n in np.flatnonzero(is_glossy).tolist() if materials.may_be_metal(n)}
-        if radiosity is None or not metals:
-            return mirrors
-        return tuple(sorted({*mirrors, *np.flatnonzero(~is_flat).tolist()} - (metals - {*mirrors})))
+        bodies, is_glossy = self._merged_scene.scene.bodies, self._merged_scene.is_glossy
+        metals = [number for number in np.flatnonzero(is_glossy).tolist() if materials.may_be_metal(number)]
+        mirrors = tuple(
+            number
+            for number in metals
+            if all(textures.sizes[number] is None for textures in materials.textures_of.values())
+            and (is_glossy.sum() > 1 or not bodies[number].mesh.is_convex)
+        )
+        senders = set(range(len(bodies))) - {*metals} if metals and have_radiosity else set()
+        return ShownBodies(mirrors, tuple(sorted(senders)))
 
     def radiance(
         self,
-        shown: tuple[int, ...],
+        shown: ShownBodies,
         points: ShadingContext,
         light: LightInput,
         materials: Materials,
@@ -69,7 +77,7 @@ class MirroredBodies:
         transmittance: Node,
         mean_radiance: Node,
         look_up: Callable[[Node, Node, Node], Node],
-        radiosity: Node | None,
+        radiosity: tuple[Node, FaceTexels] | None,
     ) -> Node:
         """Node of the radiance that bodies add to the mean of blockers, vec3 of shape [batch, receiver, sample].
 
@@ -83,7 +91,7 @@ class MirroredBodies:
             mean_radiance: Node of the mean radiance of each receiver's blockers.
             look_up: Makes the node of light without shadows, of nodes of directions, blurs, and where these rays
                 start.
-            radiosity: Node of that of the sides of faces, vec3 of shape [batch, 2 · face]; None for none.
+            radiosity: As of :meth:`.LightTransport.radiosity`.
         """
         faces, blurs = self._merged_scene.side_faces, field_of(samples, "blurs")
         directions, transmittance = (
@@ -103,12 +111,14 @@ class MirroredBodies:
             field_of(mirrored, name) for name in ("directions", "fresnel_weights", "blurs")
         )
         mirrored_light = look_up(directions, blurs, field_of(hits, "points"))
-        inputs = faces, albedo, metallic, fresnel_weights, mirrored_light, mean_radiance, transmittance, radiosity
-        return Node("light of mirrored bodies", mix_mirrored, hits, *inputs)
+        surface_radiosity, texels = radiosity or (None, None)
+        inputs = faces, albedo, metallic, fresnel_weights, mirrored_light, mean_radiance, transmittance
+        mix = functools.partial(mix_mirrored, texels=texels)
+        return Node("light of mirrored bodies", mix, hits, *inputs, surface_radiosity)
 
     def _find_hits(
         self,
-        shown: tuple[int, ...],
+        shown: ShownBodies,
         positions: wp.array,
         vertex_normals: wp.array,
         receivers: Receivers,
@@ -117,7 +127,9 @@ class MirroredBodies:
     ) -> LobeHits:
         """Trace all instances: arrays of shape [batch, receiver, sample]."""
         merged_scene = self._merged_scene
-        is_shown = constant(np.isin(merged_scene.body_of_face, shown).astype(np.int32), wp.int32, positions.device)
+        light_of_bodies = np.zeros(len(merged_scene.scene.bodies), np.int32)
+        light_of_bodies[[*shown.senders]], light_of_bodies[[*shown.mirrors]] = SENDS, MIRRORS
+        is_shown = constant(light_of_bodies[merged_scene.body_of_face], wp.int32, positions.device)
         hits = [
             trace_hits(
                 self._refitted(instance_of(positions, instance)),

@@ -13,6 +13,7 @@ from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.rays.ray_tracing import RAY_COST, escapes, first_hit
 
 MEETS_SKY, MEETS_BODY, LEAVES_BELOW = (wp.constant(number) for number in range(3))  # what becomes of a ray
+SENDS, MIRRORS = wp.constant(1), wp.constant(2)  # light of faces that counts: their radiosity; that they mirror, too
 
 wp.set_module_options({"max_unroll": 1})
 
@@ -64,14 +65,15 @@ def _trace_hits(
                 + hit.weights[1] * wp.mesh_get_point(mesh, 3 * face + 1)
                 + hit.weights[2] * wp.mesh_get_point(mesh, 3 * face + 2)
             )
-            mirrored = direction - 2.0 * cosine * normal
             barycentrics[receiver, sample] = hit.weights
             hit_normals[receiver, sample] = normal
-            rise = wp.dot(wp.mesh_eval_face_normal(mesh, face), mirrored)
-            if cosine >= 0.0 or rise * wp.where(hit.is_back, -1.0, 1.0) <= 0.0:
-                last_ray = LEAVES_BELOW
-            elif escapes(mesh, point, normal, mirrored):
-                last_ray = MEETS_SKY
+            if is_shown[face] == MIRRORS:
+                mirrored = direction - 2.0 * cosine * normal
+                rise = wp.dot(wp.mesh_eval_face_normal(mesh, face), mirrored)
+                if cosine >= 0.0 or rise * wp.where(hit.is_back, -1.0, 1.0) <= 0.0:
+                    last_ray = LEAVES_BELOW
+                elif escapes(mesh, point, normal, mirrored):
+                    last_ray = MEETS_SKY
     last_rays[receiver, sample] = last_ray
     if face >= 0 and is_back:
         face += is_shown.shape[0]
@@ -106,7 +108,7 @@ def trace_hits(
 
     Args:
         mesh: Of all bodies.
-        is_shown: 1 for faces whose own light counts, int32 of shape [face].
+        is_shown: SENDS or MIRRORS for faces whose own light counts, else 0, int32 of shape [face].
         faces: Vertices of the mesh, vec3i of shape [face].
         vertex_normals: Their unit normals, vec3 of shape [vertex].
         points, normals: Of the receivers, vec3 of shape [receiver].

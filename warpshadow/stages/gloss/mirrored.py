@@ -5,10 +5,11 @@ the mean radiance R̄ of the receiver's blockers the point adds
 
     M = (1 − T) (m F L' + (1 − m) B − R̄),   F = a + (1 − a) (1 − |n·l|)⁵,
 
-m how metallic it is, a its albedo, B the radiosity of its side of the face, and L' the radiance from l': R̄ where that
-ray meets a body, 0 where it leaves below the face that it starts on (:mod:`.lobe_hits`), else L, light without shadows,
-blurred by σ'² = σ² + 2 α², since variances of Gaussians add: σ is the blur of the sample (:mod:`.lobes`), and √2 α the
-σ of a lobe's only sample, N = K = 1, seen from above, v = h = n, where |W| = α² and μ = Λ = 1.
+m how metallic it is, a its albedo, B the radiosity there (:mod:`warpshadow.stages.planes.face_texels`), and L' the
+radiance from l': R̄ where that ray meets a body, 0 where it leaves below the face that it starts on
+(:mod:`.lobe_hits`), else L, light without shadows, blurred by σ'² = σ² + 2 α², since variances of Gaussians add: σ is
+the blur of the sample (:mod:`.lobes`), and √2 α the σ of a lobe's only sample, N = K = 1, seen from above, v = h = n,
+where |W| = α² and μ = Λ = 1.
 Where l itself leaves below the receiver's face, M = −(1 − T) R̄. Where light bounces along paths, B is R̄.
 """
 
@@ -21,6 +22,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
 from warpshadow.stages.gloss.lobe_hits import LEAVES_BELOW, MEETS_SKY, LobeHits
 from warpshadow.stages.gloss.lobes import MIN_ROUGHNESS
+from warpshadow.stages.planes.face_texels import FaceTexels, no_face_texels, radiosity_at
 from warpshadow.stages.raster.interpolation import interpolate_at
 
 _COST = 20.0  # nanoseconds that a sample takes
@@ -122,6 +124,7 @@ def _mix_mirrored(
     mean_radiance: wp.array2d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
     radiosity: wp.array2d(dtype=wp.vec3),
+    texels: FaceTexels,
     # out
     radiance: wp.array3d(dtype=wp.vec3),
 ):
@@ -149,7 +152,7 @@ def _mix_mirrored(
         fresnel = color + fresnel_weight * (wp.vec3(1.0) - color)
         diffuse = mean
         if radiosity:
-            diffuse = radiosity[instance_in(batch, radiosity.shape[0]), face]
+            diffuse = radiosity_at(radiosity[instance_in(batch, radiosity.shape[0])], texels, faces, face, weights)
         result = blocked * (metal_share * wp.cw_mul(fresnel, seen) + (1.0 - metal_share) * diffuse - mean)
     radiance[batch, receiver, sample] = result
 
@@ -164,6 +167,7 @@ def mix_mirrored(
     mean_radiance: wp.array,
     transmittance: wp.array,
     radiosity: wp.array | None = None,
+    texels: "FaceTexels | None" = None,
 ) -> wp.array:
     """Mix the radiance M that bodies add to the mean radiance of blockers in each sample.
 
@@ -174,8 +178,10 @@ def mix_mirrored(
         light: L, vec3 of shape [batch, receiver, sample].
         mean_radiance: R̄, of :func:`.reflection.find_blocked_radiance`, vec3 of shape [batch, receiver].
         transmittance: T, float32 of shape [batch, receiver, sample].
-        radiosity: B, of the sides of faces, vec3 of shape [batch, 2 · face]; None for R̄.
+        radiosity: B, of the texels of flat bodies and of the sides of faces, vec3 of shape [batch, texel + 2 · face];
+            None for R̄.
             Any batch may be 1 and then serves every instance.
+        texels: Where the faces of flat bodies are on these texels; None where no body is flat.
 
     Returns:
         Vec3 of shape [batch, receiver, sample].
@@ -186,10 +192,11 @@ def mix_mirrored(
     values |= {"mean_radiance": mean_radiance, "transmittance": transmittance, "radiosity": radiosity}
     shape = common_batch({"hits": hits.face_ids, **values}), *light.shape[1:]
     radiance = wp.empty(shape, dtype=wp.vec3, device=light.device)
+    texels = no_face_texels(light.device) if texels is None else texels
     launch(
         _mix_mirrored,
         (shape[0] * shape[1], shape[2]),
-        inputs=[hits.face_ids, hits.barycentrics, hits.last_rays, faces, *values.values()],
+        inputs=[hits.face_ids, hits.barycentrics, hits.last_rays, faces, *values.values(), texels],
         outputs=[radiance],
         shared=[
             albedo,
