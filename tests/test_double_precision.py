@@ -894,11 +894,12 @@ def test_gradients_of_the_radiosity_of_mirrored_planes_are_exact(double, planes,
     )
     all_faces = put(np.concatenate([faces, faces + 4] * 2), wp.vec3i, device)
     constants = put(random(0, 1, 8, 3), wp.vec3d, device), put(np.zeros((1, 8)), wp.float64, device)
-    filters, light, mean = (put(random(seed, 1, 1, 3, 3), wp.vec3d, device) for seed in (1, 2, 3))
+    light, mean = (put(random(seed, 1, 1, 3, 3), wp.vec3d, device) for seed in (1, 2))
+    fresnel_weights = put(random(3, 1, 1, 3), wp.float64, device)
     share = put(np.array([[[0.1, 0.3, 0.6]]]), wp.float64, device)
 
     def mix(radiosity):
-        rest = filters, light, mean.reshape((1, 3))[:, :1].contiguous(), share, radiosity, of_faces
+        rest = fresnel_weights, light, mean.reshape((1, 3))[:, :1].contiguous(), share, radiosity, of_faces
         return module.mix_mirrored(hits, all_faces, *constants, *rest)
 
     texel_count = planes.texels_of_patches.shape[0]
