@@ -392,6 +392,18 @@ def test_a_metal_mirrors_a_red_and_a_blue_part_of_a_floor_each_in_its_place(rend
     assert red > 3 * blue
 
 
+@pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render()])
+def test_a_metal_mirrors_no_body_that_blocks_no_light(render):
+    """A green sheet above a red floor, which the metal shows through it."""
+    floor = ws.Body(ws.plane(4.0), (0.8, 0.1, 0.1), name="floor")
+    sheet = ws.Body(ws.plane(4.0), (0.1, 0.8, 0.1), translation=(0, 0.3, 0), blockers=0, name="sheet")
+    wall = ws.Body(ws.plane(4.0), (1, 1, 1), rotation=(90, 0, 0), translation=(0, 0, -2), roughness=0.1, metallic=1.0)
+    camera = ws.Camera.look_at((-1, 2, 2.5), (-1, 0.5, -2), fov_y=4, size=(8, 8))
+    image = render(ws.Scene([floor, sheet, wall], ws.EnvironmentMap.constant(1.0), camera, bounces=1))[..., :3]
+    red, green, _ = image.mean(axis=(0, 1))
+    assert red > 3 * green
+
+
 def test_gradients_to_the_color_of_a_body_that_a_metal_mirrors_agree_with_differences():
     ball = ws.Body(METAL.mesh, (0.7, 0.5, 0.4), blockers=METAL.blockers, translation=(0.55, 0.5, 0))
     renderer = TorchRenderer(metal_scene(METALS[0], ball, GROUND), progress=False)

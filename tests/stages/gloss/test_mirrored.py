@@ -26,12 +26,12 @@ def put(values, dtype, device):
     return wp.array(np.asarray(values), dtype=dtype, device=device)
 
 
-def hits_of(device, transmittance=0.0, points=POINTS, normals=UP, directions=DIRECTIONS, is_shown=(2, 2, 0, 0)):
+def hits_of(device, transmittance=0.0, points=POINTS, normals=UP, directions=DIRECTIONS, light_of_face=(2, 2, 0, 0)):
     mesh = wp.Mesh(put(POSITIONS, wp.vec3, device), put(FACES.ravel(), wp.int32, device))
     arrays = [put(values, wp.vec3, device) for values in (NORMALS, points, normals, directions)]
     through = wp.full((2, 3), transmittance, dtype=wp.float32, device=device)
-    is_shown, faces = put(is_shown, wp.int32, device), put([*FACES, *FACES], wp.vec3i, device)
-    return lobe_hits.trace_hits(mesh, is_shown, faces, *arrays, through), faces
+    light_of_face, faces = put(light_of_face, wp.int32, device), put([*FACES, *FACES], wp.vec3i, device)
+    return lobe_hits.trace_hits(mesh, light_of_face, faces, *arrays, through), faces
 
 
 def expected_hits():
@@ -124,7 +124,9 @@ def test_bodies_that_are_no_metals_send_the_radiosity_of_the_side_that_samples_m
     for x, forwards in ((0.0, -1.0), (-3.0, 1.0)):
         directions = np.broadcast_to([[[forwards, 0.1, 0.2], [forwards, 0.05, 0.1], [0, 1, 0]]], (2, 3, 3))
         points = POINTS + np.float32([x, 0, 0])
-        hits, faces = hits_of(device, points=points, directions=twins.unit(directions.copy()), is_shown=(0, 0, 1, 1))
+        hits, faces = hits_of(
+            device, points=points, directions=twins.unit(directions.copy()), light_of_face=(0, 0, 1, 1)
+        )
         radiance, _ = mixed(device, batched(hits), faces, *arrays, radiosity=put(radiosity, wp.vec3, device))
         numbers = hits.face_ids.numpy()
         assert (numbers[:, :2] >= 2).all() and (numbers[:, 2] == -1).all()

@@ -421,18 +421,22 @@ class MergedScene:
             None where no such body casts a shadow.
         """
         casters = [number for number in self.shadow_casters if bodies is None or number in bodies]
-        return self._mesh(positions, np.isin(self.body_of_face, casters)) if casters else None
+        return self._mesh(positions, self.faces.numpy()[np.isin(self.body_of_face, casters)]) if casters else None
 
-    def mesh(self, positions: wp.array) -> wp.Mesh:
+    def mesh(self, positions: wp.array, *, only_casters: bool = False) -> wp.Mesh:
         """Make the mesh of all bodies.
 
         Args:
             positions: Their vertices [scene units], vec3 of shape [vertex]; they are copied.
+            only_casters: Whether rays miss the bodies that cast no shadows, whose faces then are points.
         """
-        return self._mesh(positions, np.ones(len(self.body_of_face), bool))
+        faces = self.faces.numpy()
+        if only_casters:
+            casts = np.isin(self.body_of_face, self.shadow_casters)
+            faces = np.where(casts[:, None], faces, faces[:, :1])
+        return self._mesh(positions, faces)
 
-    def _mesh(self, positions: wp.array, keeps_face: np.ndarray) -> wp.Mesh:
-        faces = self.faces.numpy()[keeps_face]
+    def _mesh(self, positions: wp.array, faces: np.ndarray) -> wp.Mesh:
         return wp.Mesh(wp.clone(positions, requires_grad=False), self._array(faces.ravel(), wp.int32))
 
     @functools.cached_property

@@ -63,9 +63,7 @@ class StaticBounces:
         if not senders.bodies:
             return direct
         factors = self._factors(points, materials, senders, at_patch_samples)
-        make = functools.partial(Node, "", _light_on_patches, at_patch_samples, factors)
-        light = points.cached("light of patches", at_patch_samples, make)
-        return self._shading(direct, light, factors, points, materials)
+        return self._shading(direct, _patch_light(at_patch_samples, factors, points), factors, points, materials)
 
     def add_free_bounces(
         self, direct: Node, transfers: Node, light: Input, points: ShadingContext, materials: Materials
@@ -123,9 +121,7 @@ class StaticBounces:
     def radiosity(self, at_patch_samples: Node, points: ShadingContext, materials: Materials) -> Node:
         """Node of the radiosity of patches in the light of :meth:`add_bounces`, vec3 of shape [batch, patch]."""
         factors = self._factors(points, materials, self._patches.senders(materials), at_patch_samples)
-        make = functools.partial(Node, "", _light_on_patches, at_patch_samples, factors)
-        light = points.cached("light of patches", at_patch_samples, make)
-        return self._radiosity_node(light, factors, points, materials)
+        return self._radiosity_node(_patch_light(at_patch_samples, factors, points), factors, points, materials)
 
     def _radiosity_node(self, patch_light: Node, factors: Node, points: ShadingContext, materials: Materials) -> Node:
         senders = self._patches.senders(materials)
@@ -202,6 +198,12 @@ class StaticBounces:
             )
 
         return points.cached("form factors", (senders, at_patch_samples), make)
+
+
+def _patch_light(at_patch_samples: Node, factors: Node, points: ShadingContext) -> Node:
+    """Node of the light on patches, vec3 of shape [batch, patch], cached for that at their samples."""
+    make = functools.partial(Node, "", _light_on_patches, at_patch_samples, factors)
+    return points.cached("light of patches", at_patch_samples, make)
 
 
 def _light_on_patches(at_patch_samples: wp.array, factors: StaticFormFactors) -> wp.array:

@@ -68,14 +68,17 @@ def mix_gloss(
     values = {name: _find_values(points, materials, name) for name in GLOSS_ARGUMENTS}
     roughness = values["roughness"]
 
+    has_metal = any(materials.may_be_metal(body) for body in np.flatnonzero(method.merged_scene.is_glossy))
+
     def sample() -> Node:
         geometry = points.normals, points.vertices, points.cameras
         find_spread = functools.partial(_find_normal_spread, method)
         spread = Node("", find_spread, points.receivers_node, *geometry, points.fragments)
         inputs = points.receivers_node, roughness, points.cameras, spread, points.fragments, points.vertices
-        return Node("lobes", functools.partial(_sample_lobes, method), *inputs, items=item_text)
+        find = functools.partial(_sample_lobes, method, method.lobes.samples_of_receiver(has_metal=has_metal))
+        return Node("lobes", find, *inputs, items=item_text)
 
-    samples = points.cached("lobes", materials.roughness, sample)
+    samples = points.cached("lobes", (materials.roughness, has_metal), sample)
     directions, weights, blurs = (field_of(samples, name) for name in ("directions", "weights", "blurs"))
     texels = _prefiltered(method, points, light)
     starts = field_of(points.receivers_node, "points")
@@ -165,6 +168,7 @@ def _find_normal_spread(
 
 def _sample_lobes(
     method: Method,
+    sample_count: int,
     receivers: Receivers,
     roughness: wp.array,
     cameras: wp.array,
@@ -176,7 +180,7 @@ def _sample_lobes(
     places, receivers_across = None, method.lobes.receivers_across
     if receivers_across > 1 and receivers.samples is not None:
         places = places_in_pixels(receivers.samples, seen.face_ids.shape[2], receivers_across)
-    arguments = receivers.points, receivers.normals, roughness, cameras, method.lobes.samples_of_receiver
+    arguments = receivers.points, receivers.normals, roughness, cameras, sample_count
     samples, fragments = sample_lobes(*arguments, spread, places, receivers_across**2), receivers.sample_fragments
     assert fragments is not None
     above = fragments, method.merged_scene.side_faces, positions, receivers.normals

@@ -4,7 +4,6 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
 import warp as wp
 
 from warpshadow.assets.known_light import KnownLight
@@ -68,11 +67,9 @@ class LobeVisibility:
         """How many receivers a pixel has across and down, if it sees one face of a body that shines alone."""
         return 1 if self._shares_receivers else self._merged_scene.scene.supersampling
 
-    @property
-    def samples_of_receiver(self) -> int:
-        """Number of samples of the lobe of a receiver."""
-        is_metal = any(np.any(body.metallic) for body in self._merged_scene.scene.bodies)
-        count = max(self.sample_count, self.metal_sample_count if is_metal else 0)
+    def samples_of_receiver(self, *, has_metal: bool) -> int:
+        """Number of samples of the lobe of a receiver, in a scene that may have a metal or not."""
+        count = max(self.sample_count, self.metal_sample_count if has_metal else 0)
         return max(count // self.receivers_across**2, min(count, _MIN_SAMPLES))
 
     def _cached(self, name: str, points: ShadingContext, light: LightInput, make: Callable[[], Node]) -> Node:

@@ -36,7 +36,7 @@ class ShownBodies(NamedTuple):
 
 
 class MirroredBodies:
-    """The bodies that lobes meet, in a mesh of all bodies that is made once and refitted to each geometry.
+    """The bodies that lobes meet, which cast shadows, in a mesh that is made once and refitted to each geometry.
 
     Args:
         merged_scene: The bodies.
@@ -129,11 +129,11 @@ class MirroredBodies:
         merged_scene = self._merged_scene
         light_of_bodies = np.zeros(len(merged_scene.scene.bodies), np.int32)
         light_of_bodies[[*shown.senders]], light_of_bodies[[*shown.mirrors]] = SENDS, MIRRORS
-        is_shown = constant(light_of_bodies[merged_scene.body_of_face], wp.int32, positions.device)
+        light_of_face = constant(light_of_bodies[merged_scene.body_of_face], wp.int32, positions.device)
         hits = [
             trace_hits(
                 self._refitted(instance_of(positions, instance)),
-                is_shown,
+                light_of_face,
                 merged_scene.faces,
                 instance_of(vertex_normals, instance),
                 instance_of(receivers.points, instance),
@@ -152,7 +152,7 @@ class MirroredBodies:
     def _refitted(self, positions: wp.array) -> wp.Mesh:
         """The mesh, of vertices of shape [vertex]; until the next is asked for."""
         if self._mesh is None:
-            self._mesh = self._merged_scene.mesh(positions)
+            self._mesh = self._merged_scene.mesh(positions, only_casters=True)
         wp.copy(self._mesh.points, positions)
         self._mesh.refit()
         return self._mesh

@@ -24,7 +24,7 @@ def _trace_hits(
     worker: int,
     # in
     mesh: wp.uint64,
-    is_shown: wp.array(dtype=wp.int32),
+    light_of_face: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     vertex_normals: wp.array(dtype=wp.vec3),
     points: wp.array(dtype=wp.vec3),
@@ -52,7 +52,7 @@ def _trace_hits(
         is_back = hit.is_back
         if hit.is_below:
             last_ray = LEAVES_BELOW
-        if is_shown[wp.max(face, 0)] == 0:
+        if light_of_face[wp.max(face, 0)] == 0:
             face = -1
         if face >= 0:
             corners = faces[face]
@@ -67,7 +67,7 @@ def _trace_hits(
             )
             barycentrics[receiver, sample] = hit.weights
             hit_normals[receiver, sample] = normal
-            if is_shown[face] == MIRRORS:
+            if light_of_face[face] == MIRRORS:
                 mirrored = direction - 2.0 * cosine * normal
                 rise = wp.dot(wp.mesh_eval_face_normal(mesh, face), mirrored)
                 if cosine >= 0.0 or rise * wp.where(hit.is_back, -1.0, 1.0) <= 0.0:
@@ -76,7 +76,7 @@ def _trace_hits(
                     last_ray = MEETS_SKY
     last_rays[receiver, sample] = last_ray
     if face >= 0 and is_back:
-        face += is_shown.shape[0]
+        face += light_of_face.shape[0]
     face_ids[receiver, sample] = face
     hit_points[receiver, sample] = point
 
@@ -96,7 +96,7 @@ HIT_TYPES = wp.int32, wp.vec3, wp.vec3, wp.int32, wp.vec3  # of the arrays of Lo
 
 def trace_hits(
     mesh: wp.Mesh,
-    is_shown: wp.array,
+    light_of_face: wp.array,
     faces: wp.array,
     vertex_normals: wp.array,
     points: wp.array,
@@ -108,7 +108,7 @@ def trace_hits(
 
     Args:
         mesh: Of all bodies.
-        is_shown: SENDS or MIRRORS for faces whose own light counts, else 0, int32 of shape [face].
+        light_of_face: SENDS or MIRRORS for faces whose own light counts, else 0, int32 of shape [face].
         faces: Vertices of the mesh, vec3i of shape [face].
         vertex_normals: Their unit normals, vec3 of shape [vertex].
         points, normals: Of the receivers, vec3 of shape [receiver].
@@ -119,6 +119,6 @@ def trace_hits(
     """
     shape, device = directions.shape, points.device
     hits = LobeHits(*(empty(shape, dtype=dtype, device=device) for dtype in HIT_TYPES))
-    inputs = [mesh.id, is_shown, faces, vertex_normals, points, normals, directions, transmittance]
+    inputs = [mesh.id, light_of_face, faces, vertex_normals, points, normals, directions, transmittance]
     launch(_trace_hits, shape, inputs=inputs, outputs=[*hits], cost=2 * RAY_COST * shape[1])
     return hits
