@@ -189,10 +189,10 @@ def test_fits_that_take_long_are_announced_with_the_way_around_them(tmp_path, mo
     monkeypatch.setattr(blockers, "fit_seconds", lambda count: 1000.0 * count)
     monkeypatch.setenv("WARPSHADOW_NUM_THREADS", "1")
     scene = scene_of(ws.Body(ws.icosphere(1.0, 1), blockers=1))
-    blockers.scene_blockers(scene, progress=True)
+    blockers.fit_scene_spheres(scene, progress=True)
     assert capsys.readouterr().err.startswith("fitting spheres to 1 mesh takes about 17 min, once; method")
-    blockers.scene_blockers(scene, progress=True)  # reads them
-    blockers.scene_blockers(scene_of(ws.Body(ws.icosphere(1.0, 2), blockers=1)), progress=False)
+    blockers.fit_scene_spheres(scene, progress=True)  # reads them
+    blockers.fit_scene_spheres(scene_of(ws.Body(ws.icosphere(1.0, 2), blockers=1)), progress=False)
     assert not capsys.readouterr().err
 
 
@@ -255,5 +255,5 @@ def test_spheres_beside_convex_parts_cost_no_warning(method, warns, monkeypatch)
         return dataclasses.make_dataclass("Fit", ["spheres"])(UNIT_SPHERE)
 
     monkeypatch.setattr(blockers, "fit_spheres", fit)
-    blockers.scene_blockers(scene_of(ws.Body(trimesh.creation.box((1, 1, 0.01))), method=method))
+    blockers.fit_scene_spheres(scene_of(ws.Body(trimesh.creation.box((1, 1, 0.01))), method=method))
     assert asked == [warns]

@@ -1,5 +1,7 @@
-"""Diagnostics of a fit: a texture that may explain any shadow; and of one that has ended: pixels without a body, wrong
-exposure, images or bodies that are not explained, a loss that was still falling.
+"""Diagnostics of a fit.
+
+Before it: factors that images show as a product, and a texture that may keep a shadow. After it: pixels without a body,
+wrong exposure, images or bodies that are not explained, a loss that was still falling.
 """
 
 import math
@@ -26,7 +28,7 @@ MAX_LAST_GAIN = 0.01  # part of its loss that a fit may still gain over a window
 MAX_EXPLAINED_SHARE = 0.5  # part of the residual's squares that a factor of an image may explain without a warning
 
 MIN_EXPOSURE_GAP = 0.2
-"""Logarithm to the base 2 of the factor from which that is of interest; a wrong pose has one, too."""
+"""Stops from which on an exposure draws a warning; smaller gaps also come from a wrong pose."""
 
 MAX_IMAGE_ERROR = 0.25  # error of images that is poor: a pose in a wrong minimum has 0.34, and where it is found 0.02
 
@@ -54,7 +56,7 @@ def small_stage(problem: Problem) -> Stage:
 
 
 def unseen_share(model: Model, images: torch.Tensor) -> float:
-    """Share of the counted pixels that see no body, for targets without coverage, which is not compared then.
+    """Share of the counted pixels that see no body; only for targets without coverage, which tells where bodies are.
 
     Such pixels are black in every image, so their residual stays, and light and reflectance cannot tell why.
     """
@@ -201,8 +203,9 @@ def warn_before(problem: Problem) -> None:
 def _free_factors(problem: Problem) -> dict[str, str]:
     """Name the free parameters that are factors of all images, and how each becomes known.
 
-    The exposure is one; the light, where all that shines is free; and the reflectance of the bodies that cameras see,
-    where that of all is free, and neither gloss, lamps that are seen nor bounces, where it counts twice, tell it.
+    The exposure is one; the light, where no map or lamp that emits is known; and the reflectance of the bodies that
+    cameras see, where that of all is free, and neither gloss, lamps that are seen nor bounces, where it counts twice,
+    tell it.
     """
     scene, cameras = problem.scene, problem.cameras()
     lit, reflecting = (

@@ -20,7 +20,7 @@ from warpshadow.inverse.free.base import Free, FreeOfBody, Values
 from warpshadow.inverse.loss import Loss
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.world import FitContext, FittedScene
-from warpshadow.scene.blockers import blocking_planes, scene_blockers
+from warpshadow.scene.blockers import blocking_planes, fit_scene_spheres
 from warpshadow.scene.remarks import is_out_of_frame
 from warpshadow.scene.scene import Scene, change_bodies, check_scene
 from warpshadow.scene.visibility import METHODS, SPHERE_METHODS, Visibility
@@ -177,7 +177,7 @@ class Problem:
         cameras = self.cameras()
         scene = replace(self.scene, camera=cameras[0], visibility=self.visibility)
         if scene.visibility.method in SPHERE_METHODS:  # another one would leave the found scene without its blockers
-            spheres = scene_blockers(scene, device=str(device), progress=progress)
+            spheres = fit_scene_spheres(scene, device=str(device), progress=progress)
             # bodies that block light as planes do so in the scene that is found, too
             reshaped = {free.number for free in self.free_of_bodies if free.reshapes}
             numbers = set(range(len(spheres))) - (set(blocking_planes(scene)) - reshaped)

@@ -64,10 +64,10 @@ class ProjectedModel(Model):
     def _darkness(self) -> torch.Tensor:
         return torch.zeros(1, self.light.basis.size, 3, device=self.context.device)
 
-    def _images_by_lights(self, world: World, lights: torch.Tensor, shining: Emission | None = None) -> torch.Tensor:
+    def _images_by_lights(self, world: World, lights: torch.Tensor, lit_lamp: Emission | None = None) -> torch.Tensor:
         """Images by lights [light, coefficient, 3] and one of the solved lamps: [light, view, height, width, 3]."""
         for lamp in self.lamps:
-            radiance = torch.full((1, 3), float(lamp is shining), device=self.context.device)
+            radiance = torch.full((1, 3), float(lamp is lit_lamp), device=self.context.device)
             lamp.apply({"radiance": radiance}, self.context, world)
         images = []
         for part in lights if len(self.cameras) > 1 else lights.split(_LIGHTS_AT_ONCE):

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from warpshadow.assets.camera import Camera
 from warpshadow.pipeline.bodies.geometry import Geometry
-from warpshadow.scene.blockers import scene_blockers
+from warpshadow.scene.blockers import fit_scene_spheres
 from warpshadow.scene.material import GLOSS_ARGUMENTS
 from warpshadow.scene.scene import Scene
 from warpshadow.scene.visibility import SPHERE_METHODS, Visibility
@@ -61,7 +61,7 @@ class FitContext:
 
         def bind() -> DeformationGraph:
             shadowed_scene = replace(self.scene, visibility=Visibility())
-            centers = scene_blockers(shadowed_scene, device=str(self.device))[body].centers
+            centers = fit_scene_spheres(shadowed_scene, device=str(self.device))[body].centers
             points = self.scene.bodies[body].mesh.positions
             return DeformationGraph.bind(points, centers, count=count, device=str(self.device))
 

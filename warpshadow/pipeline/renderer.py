@@ -320,7 +320,7 @@ class SceneRenderer:
     def draw_inputs(self, inputs: ImageArrays, view: View | None = None) -> wp.array:
         """Draw images, as :meth:`draw` does, by a record of its arguments; it does not warn of coarse faces.
 
-        This and its like take no lock, which their callers hold.
+        The methods ``…_inputs`` take no lock: callers hold it.
         """
         view = self._views.view(inputs.geometry, inputs.clip_matrices) if view is None else self._checked(view)
         light = self._method.light_input(view, inputs.light, inputs.shell)

@@ -46,7 +46,7 @@ class FitRequest(NamedTuple):
     seen_from: tuple[float, float, float] | None = None
 
 
-def scene_blockers(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> list[Spheres]:
+def fit_scene_spheres(scene: Scene, *, device: wp.DeviceLike = "cpu", progress: bool = False) -> list[Spheres]:
     """Find the spheres of each body, in its own space, fitting the wanted ones.
 
     A flat body with the middles of all others on one side is a ground (or a wall): one sphere that touches it from

@@ -47,10 +47,10 @@ class Body:
         texture: Reflectance as an image in place of ``albedo``, which then does not count, linear RGB of shape
             [height, width, 3], or a file that :func:`warpshadow.read_image` reads; needs uvs.
         blockers: Number of spheres to fit to the mesh, or "auto" for as many as it needs, 8 to 1024
-            (:func:`warpshadow.fit_spheres`), or the spheres themselves, or an .npz file of them; 0 or none casts no
-            shadow, by no method. Flat bodies, and with "auto" convex pieces and cloth, may block by their own shape
-            instead ("Blockers" in scene/README.md). Bounced light passes a body without blockers, too; "Bounces" in
-            pipeline/README.md says onto which bodies it reflects.
+            (:func:`warpshadow.fit_spheres`), or the spheres themselves, or an .npz file of them; 0, or no spheres,
+            casts no shadow, by any method. Flat bodies, and with "auto" convex pieces and cloth, may block by their own
+            shape instead ("Blockers" in scene/README.md). Bounced light passes a body without blockers, too; "Bounces"
+            in pipeline/README.md says onto which bodies it reflects.
         rotation: Axis-angle vector [degrees], shape [3]: (0, 90, 0) is a quarter turn about +y, through the origin of
             the mesh's space, wherever its vertices are. (:meth:`on_ground` stands a body on a point;
             :meth:`Renderer.placed` can turn it about its middle.) A matrix, shape [3, 3], becomes such a vector.

@@ -93,8 +93,8 @@ class Visibility:
     """How visibility is computed. A setting that the method does not read is refused unless it is the default.
 
     Args:
-        method: "directional" transmittance of spheres, "log-sh" of spheres, "none" (no shadows), or "ray-traced"
-            visibility of the meshes, the reference. "auto" leaves the choice to
+        method: "directional" transmittance of planes, convex parts and spheres, "log-sh" of spheres, "none" (no
+            shadows), or "ray-traced" visibility of the meshes, the reference. "auto" leaves the choice to
             :func:`warpshadow.tuning.tune.resolved`. None, where nothing is named: "directional" for renderers, fits and
             data sets, and for stills, as by :func:`warpshadow.render`, rays that all receivers share, which need
             neither spheres nor tables. A setting that "ray-traced" does not read names "directional".

@@ -81,7 +81,7 @@ class TorchRenderer(torch.nn.Module):
         basis: Basis of free light: ``HarmonicBasis(order)`` or ``CellBasis(directions)``; None for the native basis of
             the scene's method.
         graphs: Whether calls that come again with tensors of the same shapes are captured as CUDA graphs and replayed
-            on a GPU (:mod:`warpshadow.torch.replay`): tested with captures of a CPU alone so far.
+            on a GPU (:mod:`warpshadow.torch.replay`): tested so far only by captures that tests force on a CPU.
     Attributes:
         replays: The captured calls; ``replays.reason`` says why the last call was not replayed.
         array_renderer: The :class:`warpshadow.Renderer` of Warp's arrays that it calls; most users need it not.
@@ -226,7 +226,7 @@ class TorchRenderer(torch.nn.Module):
             Linear RGB, [height, width, 3] or [batch, height, width, 3]; see :mod:`warpshadow.stages.image.photograph`.
         Raises:
             ValueError: where no body of the scene is a catcher.
-        Differentiable: all, as :meth:`forward` is; both the light with and that without the other bodies are.
+        Differentiable: all, as :meth:`forward` is, but once; both the light with and that without the other bodies are.
         """
         arguments, slots = self._slots_of(inputs)
         size = self.cameras[0].height, self.cameras[0].width

@@ -11,7 +11,7 @@ import warpshadow as ws
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.scene_planes import ScenePlanes
-from warpshadow.scene.blockers import scene_blockers
+from warpshadow.scene.blockers import fit_scene_spheres
 from warpshadow.stages.planes import plane_blockers
 from warpshadow.torch import TorchRenderer
 
@@ -39,7 +39,7 @@ def inside_ball(image):
 
 def test_a_ground_darkens_a_ball_as_rays_find_it_and_its_sphere_does_not():
     truth = on_ball(ws.render(scene_of(method="ray-traced")))
-    own_sphere = scene_blockers(scene_of())[1]
+    own_sphere = fit_scene_spheres(scene_of())[1]
     errors = [np.abs(on_ball(ws.render(scene_of(ground=given))) - truth).mean() for given in (1, own_sphere)]
     assert errors[0] < 0.022 * truth.mean()  # measured 2.0%
     assert errors[1] > 1.5 * errors[0]

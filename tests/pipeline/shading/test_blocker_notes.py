@@ -40,7 +40,7 @@ def test_cloth_blocks_as_panels_and_many_of_them_name_the_setting_that_is_faster
     assert tent.endswith("convex parts: it is made of few panels, and its own by rays, traced once.")
     edge_count = sum(len(part.edges) for part in shapes.tent().convex_parts)
     for limit in (edge_count, edge_count - 1):
-        monkeypatch.setattr(scene_blockers, "_MANY_EDGES", limit)
+        monkeypatch.setattr(scene_blockers, "_COSTLY_EDGES", limit)
         tent, box, _ = notes([ws.Body(shapes.tent()), BOX, GROUND], method="directional")
         assert ("traced once; spheres, blockers = 256, take half of the time" in tent) == (limit < edge_count)
         assert "blockers = 256" not in box

@@ -22,7 +22,7 @@ PRIOR = 1e-3
 
 
 class Free(abc.ABC):
-    """A free parameter of a scene. Fits ask it for all that most kinds have; only `FREE` lists the classes."""
+    """A free parameter of a scene. Fits ask it for most that they have to know; few files ask for a class."""
 
     key: ClassVar[str]
     """Its name in fit files."""

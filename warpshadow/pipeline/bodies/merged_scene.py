@@ -16,7 +16,7 @@ from warpshadow.device.memory import empty
 from warpshadow.device.threads import locked
 from warpshadow.maths.spatial_sort import z_order
 from warpshadow.pipeline.bodies.geometry import CENTER, Geometry, Pivot, as_geometry, splice
-from warpshadow.scene.blockers import scene_blockers
+from warpshadow.scene.blockers import fit_scene_spheres
 from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.scene.visibility import AUTO
 from warpshadow.spheres import SHADOW_SPHERES, Spheres
@@ -225,7 +225,7 @@ class MergedScene:
         """Spheres of each body in its own space; none where the method asks for none."""
         if self._take_spheres is not None:
             return self._take_spheres()
-        return scene_blockers(self.scene, device=self.device, progress=self._progress)
+        return fit_scene_spheres(self.scene, device=self.device, progress=self._progress)
 
     @property
     def sphere_counts(self) -> np.ndarray:

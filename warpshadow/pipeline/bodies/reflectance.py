@@ -1,4 +1,4 @@
-"""Reflectance: the colors of the samples of a view, from albedo of bodies and vertices and from textures."""
+"""Materials of bodies; the colors of the samples of a view, from albedo of bodies and vertices and from textures."""
 
 import copy
 import operator
@@ -96,7 +96,7 @@ class BodyTextures:
 
 
 class Materials:
-    """Reflectance of each body.
+    """Reflectance, numbers of gloss and emission of each body.
 
     Args:
         merged_scene: The bodies.

@@ -234,7 +234,7 @@ class MovingBounces:
         Args:
             points: The receivers.
             light: The light.
-            materials: Reflectance of the bodies.
+            materials: Of the bodies.
         """
         method, senders = self._method, self._patches.senders(materials)
         projected_light = method.projected_light(points, light)

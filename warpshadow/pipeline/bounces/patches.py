@@ -115,7 +115,8 @@ class ScenePatches:
     def _contact_of_grid(self, number: int) -> Contact | None:
         """The contact of a flat body around which its texels are small.
 
-        There is one such place at most, so texels stay small around all bodies where several touch it, or a small one.
+        Texels are smallest around one point at most. None where several bodies touch it, or a small one does: then
+        they are small around all bodies.
         """
         contacts = [contact for contact in self._contacts[number] if contact.is_point]
         if len(contacts) != 1:

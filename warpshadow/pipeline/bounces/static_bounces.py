@@ -57,7 +57,7 @@ class StaticBounces:
             direct: Node of the direct shading of the receivers, vec3 of shape [batch, receiver].
             at_patch_samples: Node of that of :meth:`patch_samples`, vec3 of shape [batch, patch sample].
             points: The receivers.
-            materials: Reflectance of the bodies.
+            materials: Of the bodies.
         """
         senders = self._patches.senders(materials)
         if not senders.bodies:
@@ -75,7 +75,7 @@ class StaticBounces:
             transfers: Node of the transfer vectors of the patch samples, [1, patch sample, coefficient], in portions.
             light: The coefficients.
             points: The receivers.
-            materials: Reflectance of the bodies.
+            materials: Of the bodies.
         """
         senders = self._patches.senders(materials)
         if not senders.bodies:
@@ -155,7 +155,7 @@ class StaticBounces:
     def openness(self, points: ShadingContext, materials: Materials, at_patch_samples: Node | None) -> Node | None:
         """Part of the hemispheres of points that no blocker takes, by the rays that find the light of blockers.
 
-        Both so vary alike, and blockers' mean radiance does not.
+        So openness and bounced light have the same noise, which cancels in their ratio, the blockers' mean radiance.
 
         Args:
             points, materials: As above.

@@ -81,7 +81,8 @@ def _order_by_tiles(size: tuple[int, int], supersampling: int) -> tuple[np.ndarr
     """Order the probes of a grid by 4 × 4 tiles, so that neighbors are shaded one after another.
 
     Returns:
-        The number of each in the grid, and that of its sample; in the end, for −1, the number after the last, and −1.
+        Two arrays: index of each probe in the grid, and of its sample. Both end with an item for index −1: the number
+        of probes, and −1.
     """
     rows, columns = probe_grid(size, supersampling)
     row, column = np.divmod(np.arange(len(rows) * len(columns)), len(columns))

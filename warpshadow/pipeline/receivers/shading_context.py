@@ -53,7 +53,7 @@ class ShadingContext:
 
     Args:
         merged_scene: The bodies among which they are.
-        materials: Reflectance of the scene's bodies.
+        materials: Of the scene's bodies.
         vertices: Positions of all vertices.
         spheres: Centers and radii of the spheres.
         receivers: The points.

@@ -1,8 +1,8 @@
 """Mirrored bodies: light that bodies add to the mean radiance of blockers, where rays say which ones lobes meet.
 
-As bodies and cameras move, the mirrored light changes within a metal's outline in a lobe, and the outline moves; most
-of both cancels. Hits know no outlines, so the first alone would make gradients wrong (of two balls 2.6 times too
-large). So hits, and how much of them is seen, are constants: the gradient is that of the mean radiance.
+As bodies and cameras move, two terms of the gradient nearly cancel: the mirrored light changes within a metal's outline
+in a lobe, and the outline moves. Hits give the first alone, which is 2.6 times too large (two balls). So neither is
+used: hits, and how much of them is seen, are constants, and the gradient is that of the mean radiance.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class ShownBodies(NamedTuple):
     """Bodies whose own light counts where lobes meet them, by number."""
 
     mirrors: tuple[int, ...]  # metals
-    senders: tuple[int, ...]  # others, of which only their radiosity counts
+    nonmetals: tuple[int, ...]  # others, which show their radiosity; () without a metal, or if it is not known
 
 
 class MirroredBodies:
@@ -49,8 +49,8 @@ class MirroredBodies:
     def shown(self, materials: Materials, *, have_radiosity: bool) -> ShownBodies:
         """Find the bodies whose own light counts where lobes meet them.
 
-        Metals without textures mirror light: others shine, too, or they are not convex. Beside a metal, bodies that
-        are none show their radiosity.
+        A metal without textures mirrors light if a lobe can meet it: if another body shines, or it is not convex.
+        Where there is a metal, bodies that are none show their radiosity.
 
         Args:
             materials: Of the bodies.
@@ -64,8 +64,8 @@ class MirroredBodies:
             if all(textures.sizes[number] is None for textures in materials.textures_of.values())
             and (is_glossy.sum() > 1 or not bodies[number].mesh.is_convex)
         )
-        senders = set(range(len(bodies))) - {*metals} if metals and have_radiosity else set()
-        return ShownBodies(mirrors, tuple(sorted(senders)))
+        nonmetals = set(range(len(bodies))) - {*metals} if metals and have_radiosity else set()
+        return ShownBodies(mirrors, tuple(sorted(nonmetals)))
 
     def radiance(
         self,
@@ -128,7 +128,7 @@ class MirroredBodies:
         """Trace all instances: arrays of shape [batch, receiver, sample]."""
         merged_scene = self._merged_scene
         light_of_bodies = np.zeros(len(merged_scene.scene.bodies), np.int32)
-        light_of_bodies[[*shown.senders]], light_of_bodies[[*shown.mirrors]] = SENDS, MIRRORS
+        light_of_bodies[[*shown.nonmetals]], light_of_bodies[[*shown.mirrors]] = SENDS, MIRRORS
         light_of_face = constant(light_of_bodies[merged_scene.body_of_face], wp.int32, positions.device)
         hits = [
             trace_hits(

@@ -18,7 +18,7 @@ from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
 from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
 from warpshadow.scene.blockers import why_spheres_block
 
-_MANY_EDGES = 400
+_COSTLY_EDGES = 400
 """Edges of a body's convex parts above which images take twice as long as past spheres, or longer: of sheets with 449
 and 475 edges 130 and 151 ms, past 256 spheres 59 and 63, of a vase with 1544 200 and 58, of a bowl with 1684 209 and
 60. They are 3.1, 3.2, 3.5 and 4.0% off, past spheres 6.3, 6.2, 4.3 and 7.8% (256² pixels, a thread of an EPYC)."""
@@ -92,13 +92,24 @@ class SceneBlockers:
 
     def place_blockers(self, kinds: BlockerKinds, positions: wp.array, spheres: tuple[wp.array, wp.array]) -> Blockers:
         """Place the blockers among bodies, by their vertices and spheres. Differentiable: these."""
-        owners = self.planes, self.parts, self.self_visibility, self._merged_scene.scene.visibility.merging
         frames = self.planes.frames(kinds.planes, positions) if kinds.planes else None
         placed_parts = self.parts.place_parts(kinds.convex, positions) if kinds.convex else None
         body_sides = None
         if kinds.planes or (self.planes.numbers and self._merged_scene.scene.bounces):
             body_sides = BodySides(self.planes, positions)
-        return Blockers(self._merged_scene, kinds, *owners, positions, spheres, frames, placed_parts, body_sides)
+        return Blockers(
+            self._merged_scene,
+            kinds,
+            planes=self.planes,
+            parts=self.parts,
+            self_visibility=self.self_visibility,
+            merging=self._merged_scene.scene.visibility.merging,
+            positions=positions,
+            spheres=spheres,
+            frames=frames,
+            placed_parts=placed_parts,
+            body_sides=body_sides,
+        )
 
     def has_any(self, kinds: BlockerKinds, bodies: Iterable[int] | None = None) -> bool:
         """Whether some bodies, by default all, block light by spheres or convex parts."""
@@ -145,7 +156,7 @@ class SceneBlockers:
             return "as a part of a plane: it is flat"
         count = int(self._part_counts(kinds)[body])
         parts = f"as {count} convex part{'s' * (count != 1)}"
-        is_costly = body in kinds.convex and sum(len(part.edges) for part in self.parts.parts[body]) > _MANY_EDGES
+        is_costly = body in kinds.convex and sum(len(part.edges) for part in self.parts.parts[body]) > _COSTLY_EDGES
         costs = "; spheres, blockers = 256, take half of the time or less, and are up to twice as far off" * is_costly
         if body in kinds.solids:
             return f"{parts}, its own, too: it consists of them{costs}"

@@ -18,8 +18,8 @@ from warpshadow.stages.shell.shell_rays import check_within
 from warpshadow.stages.shell.shell_transfer import shell_transfer
 
 SHELL_BASIS = CellBasis(fibonacci(512))
-"""Cells of a shell. Under even light, receivers at up to 0.9 radii from its center are 1% off on average; with 1024
-0.4%, in twice the time."""
+"""Cells of a shell. Under even light, receivers anywhere within 0.9 radii of its center are 1.4% off, at 0.9 radii 6%;
+with 1024 cells 0.4 and 1.9%, in twice the time (root mean squares)."""
 
 
 class ShellCells(NamedTuple):

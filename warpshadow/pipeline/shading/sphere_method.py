@@ -356,10 +356,10 @@ class VisibilityNode(Node):
 
     def portions(self, call: Call) -> Iterator[Any]:
         """Find it for one portion after another."""
-        receivers, blockers, projected_light, *cached = self.values(call)
+        receivers, blockers, projected_light, self_lookups, *of_static_bodies = self.values(call)
         total = len(receivers.static_vertices) + receivers.points.shape[1]
         with progress_bar(total, "shading", "receiver", shows=self._progress) as bar:
-            for group in self._portions_of(receivers, blockers, *cached):
+            for group in self._portions_of(receivers, blockers, self_lookups, *of_static_bodies):
                 portion = LitPortion(group, self._find_visibility(call, group, projected_light), blockers.spheres)
                 yield self._result_of(self.add_step(call, portion, projected_light))
                 bar.update(group.points.shape[1])

@@ -180,7 +180,7 @@ class SceneViews:
         )
 
     def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray, geometry: Geometry | None = None) -> ShadingContext:
-        """Points on faces of bodies to be lit by :meth:`.SceneRenderer.shade`, by whose own bodies it knows them.
+        """Points on faces to be lit by :meth:`.SceneRenderer.shade`, which knows their bodies: self-visibility counts.
 
         Args:
             sides: Face of each, backs numbered after the last face, int of shape [receiver]; receivers of a body are
@@ -190,11 +190,11 @@ class SceneViews:
         Differentiable: geometry.
         """
         merged_scene, blocker_kinds, bodies = self._merged_scene, self._blocker_kinds(geometry), self._bodies(geometry)
-        owners = self._receivers.distinct_bodies(blocker_kinds)
-        if owners is not None:
-            owners = owners[merged_scene.body_of_face[sides % len(merged_scene.body_of_face)]]
+        distinct = self._receivers.distinct_bodies(blocker_kinds)
+        if distinct is not None:
+            distinct = distinct[merged_scene.body_of_face[sides % len(merged_scene.body_of_face)]]
         normals = Node("", vertex_normals, bodies[0], merged_scene.faces)
-        node = Node("", receivers_on_faces, bodies[0], normals, merged_scene.faces, sides, barycentrics, owners)
+        node = Node("", receivers_on_faces, bodies[0], normals, merged_scene.faces, sides, barycentrics, distinct)
         points = merged_scene, self._materials, *bodies, node, self.call()
         return ShadingContext(*points, normals=normals, blocker_kinds=blocker_kinds)
 

@@ -40,7 +40,7 @@ class ConvexArrays:
     blocks: wp.array(dtype=wp.int32)  # whether a piece casts shadows
     first_part: wp.array(dtype=wp.int32)  # of each piece, and the end of the last
     first_piece: wp.array(dtype=wp.int32)  # of each compound, and the end of the last
-    hulls: wp.array(dtype=wp.int32)  # the part that is the hull of each compound, none of the piece's; −1 for none
+    hulls: wp.array(dtype=wp.int32)  # index of each compound's hull, a part after those of pieces; −1 without one
     signs: wp.array(dtype=wp.float32)  # of the coverage of each part: −1 for seams, which are a piece's last
     gaps: wp.array(dtype=wp.float32)  # height above each part up to which receivers of its body lie, over its radius
     first_corner: wp.array(dtype=wp.int32)  # of each part, and the end of the last

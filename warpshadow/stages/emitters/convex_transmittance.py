@@ -8,8 +8,9 @@ the outward normals N_f and offsets o_f of the faces that x sees, it takes the s
 
 of the beam of the sample, a disc of radius R; S is the smoothstep from −1 to 1. Parts of a piece of a body are beside
 each other, so their shares add up: T = max(1 − Σ a, 0.0001) is left past the piece, and where two parts touch, all of a
-sample is hidden. So do those of a compound (:mod:`warpshadow.stages.convex.coverage`), up to the share of its hull, of
-which a receiver inside sees none. Else pieces are independent.
+sample is hidden. Seams, which :mod:`warpshadow.stages.convex.coverage` subtracts, are left out. Shares of the parts of
+a compound add up, too, to at most the share of its hull; a receiver inside the hull sees no silhouette of it, and there
+is no such bound. Else pieces are independent.
 
 A bulb in an open shade of 15 panels in a room is 3.5% off; with products, which let a quarter of a sample's light
 through at seams, 5.0%. Sums over all of a body are no better: two rows of slats behind each other are darker.

@@ -13,9 +13,10 @@ A sample less than r above the plane, on the receiver's side, lies beyond it in 
     a S((1 − (y_n + 2ε) / r) / 2),   r = max(R √(1 − (k·n)²), ε)
 
 y_n is the height of the sample's middle, r how far its disc, of normal k, reaches along n, and ε the plane's margin, a
-thousandth of a texel; 2ε makes a lamp in the plane whole. A disc is wider than a sample of a thin lamp, which may lie
-on the plane: r counts as far as the lamp is on both sides. (With samples wholly beyond or not at all, a lamp half in
-the ground was off by −7 to +8%.)
+thousandth of a texel; 2ε makes a lamp in the plane whole. The disc of a thin lamp is wider than the lamp, which may lie
+on the plane. So the first term of r is scaled by how far the plane divides the lamp: 0 for a lamp on one side, 1 where
+at least a sixteenth of it is beyond. (With samples wholly beyond or not at all, a lamp half in the ground was off by −7
+to +8%.)
 """
 
 import warp as wp

@@ -87,7 +87,7 @@ class LobeHits(NamedTuple):
     face_ids: wp.array  # sides of faces, int32; −1 for a sample that meets no such body: it has no other number
     barycentrics: wp.array  # vec3
     normals: wp.array  # unit normals on the side that is met, vec3
-    last_rays: wp.array  # end of the mirrored ray, or of the sample if it meets no body: MEETS_SKY or another; int32
+    last_rays: wp.array  # end of a mirrored ray; of samples that meet no metal LEAVES_BELOW, or MEETS_BODY for all else
     points: wp.array  # vec3 [scene units]; the receiver of a sample that meets no such body
 
 

@@ -20,7 +20,8 @@ from warpshadow.device.memory import zeros
 from warpshadow.stages.raster.rasterization import Fragments
 
 _RANGE = 0.8
-"""Change of a barycentric within a face: over a triangle one deviates by as much as numbers that are even over 0.8."""
+"""Change of a barycentric within a face: its standard deviation over a triangle is that of a uniform number of a range
+of 0.8."""
 
 _MAX_SQUARE = 1.0  # most of |a|² + |b|²
 

@@ -1,8 +1,9 @@
 """Prefiltered light: a map blurred by Gaussians of rising width, and its lookup.
 
-Level 0 is the map; level k ≥ 1 has a Gaussian of σ = 2^(k−1) π / rows around each direction, and texels as wide as σ.
-A lookup of a blur σ is linear in log σ between two levels, and bilinear between their texels. Levels stand one after
-another, each a latitude by longitude grid as :class:`warpshadow.EnvironmentMap` has it. It is linear in the map.
+Level 0 is the map; level k ≥ 1 has a Gaussian of σ = 2^(k−1) π / rows around each direction, and texels as wide as σ,
+but at least 16 rows of them. A lookup of a blur σ is linear in log σ between two levels, and bilinear between their
+texels. Levels stand one after another, each a latitude by longitude grid as :class:`warpshadow.EnvironmentMap` has it.
+It is linear in the map.
 """
 
 import functools

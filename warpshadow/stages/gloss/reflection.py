@@ -1,8 +1,8 @@
 """Reflection: the light of a lobe and diffuse light, as glTF mixes them for metals and for all else.
 
 With G = Σ w (T L + (1 − T) R + M) and G' = Σ w' (T L + (1 − T) R + M) over the samples of a lobe, T their
-transmittance, R the mean radiance of blockers and M the radiance that metals add to it (:mod:`.mirrored`), diffuse
-light E, metallic m, specular s and F₀ = 0.04, a surface of albedo a reflects a A + C:
+transmittance, R the mean radiance of blockers, M the radiance that bodies which lobes meet add to it
+(:mod:`.mirrored`), diffuse light E, metallic m, specular s and F₀ = 0.04, a surface of albedo a reflects a A + C:
 
     A = (1 − m) (E − s (F₀ E + (1 − F₀) E')) + m (G − G'),
     C = (1 − m) s (F₀ G + (1 − F₀) G') + m G'.

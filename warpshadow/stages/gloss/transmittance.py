@@ -5,10 +5,11 @@
 over the cells near l, ρ their radius and s the smoothstep from 0 at −1 to 1 at 1: the part of a cell that is above the
 receiver's horizon. Of a ball, T_q is H_q: it blocks nothing above its horizon.
 
-Of a sample of a lobe, which is narrower than cells, most is let through or nothing; between cells an edge of a shadow
-is as wide as three of them. So its transmittance is T² (3 − 2 T), with edges in their places that are half again as
-steep, as magnified coverage is [Green 2007, Improved Alpha-Tested Magnification for Vector Textures]: in direct light
-a metal ball on a ground is 3.4 in place of 6.3% off (roughness 0.2), a bear 8.1 in place of 9.6%.
+A sample of a lobe is narrower than a cell, and so mostly blocked wholly or not at all; but an edge of a shadow that is
+interpolated between cells is as wide as three of them. T² (3 − 2 T) is taken in place of T: edges stay where they are,
+and are 1.5 times as steep, as magnified coverage is [Green 2007, Improved Alpha-Tested Magnification for Vector
+Textures]. In direct light a metal ball on a ground is 3.4 in place of 6.3% off (roughness 0.2), a bear 8.1 in place of
+9.6%.
 """
 
 import numpy as np

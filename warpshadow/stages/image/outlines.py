@@ -1,9 +1,9 @@
 """Outlines: samples near them move by the mean slopes of :mod:`.slopes` where else derivatives are exact.
 
-Up to :data:`REACH` steps from an outline they replace exact derivatives, which samples keep elsewhere: those that are
-receivers themselves, and, for its detail, the albedo of vertices or a texture. Towards a limb an exact slope is often
-tiny and rarely huge, and does not match the colors at the edges. Color is a product, light times albedo, of which
-either factor moves or both do.
+Two quantities have exact derivatives: the light of a sample that is a receiver, and the albedo of vertices or a
+texture, for its detail. Within :data:`REACH` steps of an outline both get mean slopes instead: towards a limb an exact
+slope is often tiny and rarely huge, and does not match the colors at the edges. Color is a product, light times albedo,
+of which either factor moves or both do.
 """
 
 from dataclasses import replace
@@ -150,14 +150,14 @@ def find_outline_samples(
 def _detach_adjoint(
     # in
     has_mean_slope: wp.array2d(dtype=wp.bool),
-    adj_held: wp.array2d(dtype=wp.vec3),
+    adj_detached: wp.array2d(dtype=wp.vec3),
     # out
     adj_barycentrics: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a sample."""
     view, sample = wp.tid()
     if not has_mean_slope[view, sample]:
-        adj_barycentrics[view, sample] += adj_held[view, sample]
+        adj_barycentrics[view, sample] += adj_detached[view, sample]
 
 
 def detach_near_outlines(fragments: Fragments, has_mean_slope: wp.array) -> Fragments:
@@ -169,15 +169,15 @@ def detach_near_outlines(fragments: Fragments, has_mean_slope: wp.array) -> Frag
     Differentiable: barycentrics of the other samples.
     """
     barycentrics = fragments.barycentrics
-    held_barycentrics = differentiable(
+    detached_barycentrics = differentiable(
         lambda _: None,
-        lambda adj_held: launch(
+        lambda adj_detached: launch(
             _detach_adjoint,
             has_mean_slope.shape,
-            inputs=[has_mean_slope, rows(adj_held)],
+            inputs=[has_mean_slope, rows(adj_detached)],
             outputs=[rows(barycentrics.grad)],
         ),
         copied(barycentrics),
         [barycentrics],
     )
-    return replace(fragments, barycentrics=held_barycentrics)
+    return replace(fragments, barycentrics=detached_barycentrics)

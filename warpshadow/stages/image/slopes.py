@@ -28,11 +28,9 @@ They do, since
 
 Near outlines mean slopes also replace exact derivatives (:mod:`.outlines`).
 
-| gradients of a ball of metal | without it | with it | differences of images |
-| --- | --- | --- | --- |
-| extent / weight, before a sun | −3500 | 1630 | 1300 |
-| mean slopes near outlines, mirroring | half | | 1 |
-| a second step near outlines, at a sun's highlight three samples wide | wrong sign | | |
+Without the factor extent / weight the gradient of a ball of metal before a sun is −3500, with it 1630; differences of
+images say 1300. Without mean slopes near outlines that of a mirroring ball is half of it; with them up to one step away
+in place of two it has the wrong sign at a sun's highlight that is three samples wide.
 """
 
 import math

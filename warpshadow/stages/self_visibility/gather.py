@@ -3,7 +3,7 @@
     T_self(x, q) = Σ_k w_qk Σ_j b_j S[row_j, c_qk]
 
 over the lookups of cell q (:mod:`.lookup`) and the three rows of the receiver with their weights b (:mod:`.probes`).
-It is found where the receiver's horizon is below, and 1 elsewhere, where the cosine is zero.
+It is found for cells above the receiver's horizon; for others, where the cosine is zero, it is 1.
 
 Receivers of a block look up the same coarse cells, each in rows of its own. So these are first brought into lanes: then
 a lookup is one vector, where it would be bytes from all over memory. A single lane reads its bytes.
