@@ -365,7 +365,11 @@ def metal_scene(*bodies):
     return ws.Scene(bodies, SKY, camera, supersampling=2, bounces=1, visibility=ws.Visibility(directions=64))
 
 
-@pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render()])
+def by_paths(scene):
+    return ws.render(dataclasses.replace(scene, visibility=ws.Visibility("ray-traced", samples=64)))
+
+
+@pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render(), by_paths])
 def test_a_metal_mirrors_a_red_and_a_blue_ball_each_in_its_place(render):
     """By the mean radiance of blockers red would be less than twice blue."""
     colors, positions = ((0.8, 0.1, 0.1), (0.1, 0.1, 0.8)), ((-0.5, 0, 1), (0.5, 0, 1))
@@ -380,7 +384,7 @@ def test_a_metal_mirrors_a_red_and_a_blue_ball_each_in_its_place(render):
     assert red > 5 * blue
 
 
-@pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render()])
+@pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render(), by_paths])
 def test_a_metal_mirrors_a_red_and_a_blue_part_of_a_floor_each_in_its_place(render):
     """The floor is one face in each half of its texture, and its mean radiance is as red as blue."""
     texture = np.repeat(np.array([[[0.8, 0.1, 0.1], [0.1, 0.1, 0.8]]], np.float32), 32, axis=1).repeat(64, axis=0)
@@ -392,7 +396,7 @@ def test_a_metal_mirrors_a_red_and_a_blue_part_of_a_floor_each_in_its_place(rend
     assert red > 3 * blue
 
 
-@pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render()])
+@pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render(), by_paths])
 def test_a_metal_mirrors_no_body_that_blocks_no_light(render):
     """A green sheet above a red floor, which the metal shows through it."""
     floor = ws.Body(ws.plane(4.0), (0.8, 0.1, 0.1), name="floor")

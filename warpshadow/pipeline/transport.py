@@ -164,8 +164,8 @@ class LightTransport:
 
         Returns:
             Node of that of the texels of flat bodies and of the sides of faces, vec3 of shape [batch, texel +
-            2 · face], and where faces are on texels; None where light does not bounce, or along paths, or where it is
-            free among static patches, of which only transfer is known.
+            2 · face], and where faces are on texels; None where light does not bounce, or where it is free among
+            static patches, of which only transfer is known. Beside light along paths it is that of static patches.
         """
         senders = self._patches.senders(materials) if self.method.merged_scene.scene.bounces else None
         if senders is None or not senders.bodies:
@@ -173,7 +173,7 @@ class LightTransport:
         solver = self.bounce_solver(points, light, materials)
         if solver is BounceSolver.MOVING:
             patch_radiosity = field_of(self._moving_bounces.radiosity(points, light, materials), "radiosity")
-        elif solver is BounceSolver.STATIC and not light.is_free:
+        elif not light.is_free:
             at_patch_samples = self._lit_patch_samples(points, light, materials)
             patch_radiosity = self._static_bounces.radiosity(at_patch_samples, points, materials)
         else:

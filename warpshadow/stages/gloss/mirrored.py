@@ -10,7 +10,7 @@ radiance from l': R̄ where that ray meets a body, 0 where it leaves below the f
 (:mod:`.lobe_hits`), else L, light without shadows, blurred by σ'² = σ² + 2 α², since variances of Gaussians add: σ is
 the blur of the sample (:mod:`.lobes`), and √2 α the σ of a lobe's only sample, N = K = 1, seen from above, v = h = n,
 where |W| = α² and μ = Λ = 1.
-Where l itself leaves below the receiver's face, M = −(1 − T) R̄. Where light bounces along paths, B is R̄.
+Where l itself leaves below the receiver's face, M = −(1 − T) R̄.
 """
 
 from typing import NamedTuple
