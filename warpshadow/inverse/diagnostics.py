@@ -258,12 +258,14 @@ def _warn_of_error(model: Model, images: torch.Tensor, explained: Mapping[int, f
     if error > MAX_IMAGE_ERROR or unexplained:
         shown = ", ".join(f"{part:.0%} of {names[number]!r}" for number, part in unexplained.items())
         shown = f", and targets show {shown}, shadows included" if shown else ""
-        reason = (
-            "the loss was still falling: give the last stage more iterations"
-            if is_falling
-            else "a pose may be in another minimum, which other starts or candidates leave; or light, reflectance, "
-            "shapes or the camera are not those of the targets"
-        )
+        reason = "light, reflectance, shapes or the camera may not be those of the targets"
+        if explained:
+            reason = (
+                "a pose may be in another minimum, which more candidates of its stages, or of a larger spread, leave, or "
+                f'stands_on = "…" excludes; or {reason}'
+            )
+        if is_falling:
+            reason = "the loss was still falling: give the last stage more iterations"
         check.warn(
             f"the fit explains the targets poorly: images are off by {error:.0%} of their root mean square"
             f"{shown}; {reason}",
