@@ -261,8 +261,8 @@ def _warn_of_error(model: Model, images: torch.Tensor, explained: Mapping[int, f
         reason = "light, reflectance, shapes or the camera may not be those of the targets"
         if explained:
             reason = (
-                "a pose may be in another minimum, which more candidates of its stages, or of a larger spread, leave, or "
-                f'stands_on = "…" excludes; or {reason}'
+                "a pose may be in another minimum, which more candidates of its stages, or of a larger spread, leave, "
+                f'or stands_on = "…" excludes; or {reason}'
             )
         if is_falling:
             reason = "the loss was still falling: give the last stage more iterations"
