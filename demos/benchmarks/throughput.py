@@ -71,7 +71,7 @@ SETTINGS = (
     Setting(receivers="pixel"),
     *(Setting({"directions": count}, receivers="pixel") for count in (64, 32, 16)),
     Setting({"directions": 32}, 16, "pixel"),
-    Setting({"method": "log-sh", "order": 4}, receivers="pixel"),
+    *(Setting({"method": "log-sh", "order": 4}, count, "pixel") for count in (64, 16)),
     Setting({"method": "none"}, receivers="pixel"),
 )
 
