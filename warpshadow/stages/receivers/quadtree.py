@@ -28,7 +28,10 @@ _FINE_PIXELS = 2**14
 with half as many probes a barn of planks is 28% off in 96² pixels, with these 12%, by pixel 9%."""
 
 _SQUARE_COST = 50.0  # nanoseconds that one of the largest squares takes
-TOLERANCE = 0.02  # error of interpolation at which a square is cut, as a part of the light where nothing blocks any
+TOLERANCE = 0.01
+"""Error of interpolation at which a square is cut, as a part of the light where nothing blocks any. Pose gradients of a
+bunny on a ground are 8.1 and 5.3% off (64², 128² pixels; eight poses), 8.4 and 5.9% with 0.02, whose receivers are up
+to 3% fewer."""
 
 
 class Quadtree(NamedTuple):
