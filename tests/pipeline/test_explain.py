@@ -669,7 +669,7 @@ def test_an_explanation_computes_nothing(monkeypatch):
     scene = scene_of()
     scene = dataclasses.replace(scene, bodies=[dataclasses.replace(body, blockers=7) for body in scene.bodies])
     renderer = SceneRenderer(scene)
-    monkeypatch.setattr(merged_scene, "scene_blockers", None)
+    monkeypatch.setattr(merged_scene, "fit_scene_spheres", None)
     monkeypatch.setattr(warp_internals, "bound_kernel", None)
     assert "up to 902 receivers × up to 14 spheres" in str(renderer.explain())
 
