@@ -408,6 +408,13 @@ def test_a_metal_mirrors_no_body_that_blocks_no_light(render):
     assert red > 3 * green
 
 
+def test_metals_that_mirror_bodies_along_paths_take_no_batch_of_geometries():
+    renderer = TorchRenderer(dataclasses.replace(metal_scene(METAL, GROUND), visibility=ws.Visibility("ray-traced")))
+    poses = [torch.stack([values, values]) for values in renderer.scene_poses()]
+    with pytest.raises(ValueError, match="geometry: got a batch of 2 .* or bodies of metal, expected one"):
+        renderer(geometry=renderer.placed(*poses))
+
+
 def test_gradients_to_the_color_of_a_body_that_a_metal_mirrors_agree_with_differences():
     ball = ws.Body(METAL.mesh, (0.7, 0.5, 0.4), blockers=METAL.blockers, translation=(0.55, 0.5, 0))
     renderer = TorchRenderer(metal_scene(METALS[0], ball, GROUND), progress=False)

@@ -102,8 +102,8 @@ def find_form_factors(
 
     if len(positions) > 1:
         raise ValueError(
-            f'geometry: got a batch of {len(positions)} for method "ray-traced" with bounces and free light or given '
-            'reflectance, expected one; method = "directional" takes batches'
+            f'geometry: got a batch of {len(positions)} for method "ray-traced" with bounces and free light, given '
+            'reflectance or bodies of metal, expected one; method = "directional" takes batches'
         )
     mesh, patch_of_sides = _mesh(positions.numpy()[0], senders)
     rays, bright = STILL_RAYS if is_still else RAYS, None
