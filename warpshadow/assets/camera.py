@@ -386,6 +386,14 @@ class Camera:
         intrinsics = np.diag([width / self.width, height / self.height, 1.0]) @ self.intrinsics
         return replace(self, intrinsics=intrinsics, width=width, height=height)
 
+    def with_size(self, size: ImageSize) -> Camera:
+        """Give a view an image of another size [pixels]: of the same vertical field of view, wider or less wide."""
+        width, height = check.image_size(size)
+        factor = height / self.height
+        intrinsics = np.diag([factor, factor, 1.0]) @ self.intrinsics
+        intrinsics[0, 2] += (width - self.width * factor) / 2
+        return replace(self, intrinsics=intrinsics, width=width, height=height)
+
     def clip_matrix(self) -> np.ndarray:
         """World to clip space (convention: see the module), float64, shape [4, 4]."""
         ndc_matrix = np.array([[2.0 / self.width, 0.0, -1.0], [0.0, 2.0 / self.height, -1.0]])

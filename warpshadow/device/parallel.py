@@ -125,10 +125,13 @@ class ScratchStruct(NamedTuple):
 
     def allocate(self, rows: int, device: wp.Device) -> Any:
         """Make the struct with its arrays."""
-        scratch = self.struct()
-        for field, shape in self.shapes.items():
-            setattr(scratch, field, empty((rows, *shape), warp_internals.field_dtype(self.struct, field), device))
-        return scratch
+        return warp_internals.struct_of(
+            self.struct,
+            **{
+                field: empty((rows, *shape), warp_internals.field_dtype(self.struct, field), device)
+                for field, shape in self.shapes.items()
+            },
+        )
 
 
 def run_length(device: wp.Device, width: int) -> int:

@@ -99,6 +99,9 @@ def explained_shares(model: Model, values: Mapping[str, Values]) -> dict[int, fl
     little of the images counts as much as a large one. Of a body with outlines it is the share that its mask and an
     outline have in common.
     """
+    numbers = sorted({free.number for free in model.problem.free_of_bodies if free.reframes})
+    if not numbers:
+        return {}
     far = _FAR * float(model.context.distances.max())
     result: dict[int, float] = {}
     with torch.no_grad():
@@ -106,7 +109,7 @@ def explained_shares(model: Model, values: Mapping[str, Values]) -> dict[int, fl
         images = _in_units(model, world.images())
         residuals = (_in_units(model, model.targets) - images).norm(dim=-1)
         outlined_shares = {} if model.outlines is None else _outlined_shares(model.outlines, world)
-        for number in sorted({free.number for free in model.problem.free_of_bodies if free.reframes}):
+        for number in numbers:
             if number in outlined_shares:
                 result[number] = outlined_shares[number]
                 continue

@@ -5,7 +5,7 @@ import functools
 import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import numpy as np
@@ -120,7 +120,7 @@ def _scene(scene: Table, folder: Path, bounces: Bounces | None, size: ImageSize 
             camera = _framing(camera_table | ({} if size is None else {"size": size}), bodies)
         else:
             camera = parse_camera(camera_table)
-            camera = camera if size is None else _with_size(camera, size)
+            camera = camera if size is None else camera.with_size(size)
     with check.located("[visibility]"):
         value = scene.get("visibility", {})
         toml_tables.check_table(value)
@@ -137,14 +137,6 @@ def _framing(table: Table, bodies: Sequence[Body]) -> Camera:
     if placed is not None:
         raise ValueError(f"{placed}: got it beside framing, which finds the place of the camera; expected one of them")
     return toml_tables.make(functools.partial(Camera.framing, bodies), table)
-
-
-def _with_size(camera: Camera, size: ImageSize) -> Camera:
-    """The camera with an image of another size: its field of view stays the same vertically, and pixels as square."""
-    width, height = check.image_size(size)
-    intrinsics = np.diag([height / camera.height, height / camera.height, 1.0]) @ camera.intrinsics
-    intrinsics[0, 2] += (width - camera.width * height / camera.height) / 2
-    return replace(camera, intrinsics=intrinsics, width=width, height=height)
 
 
 def _check_keys(name: str, table: Table, known: Iterable[str] = (), *, noun: str = "key") -> None:

@@ -139,12 +139,17 @@ class Blockers(NamedTuple):
         return GroupSpheres(centers, radii, ranges) if radii.shape[1] else None
 
     def around(self, body: int = -1, of_bodies: Iterable[int] | None = None) -> GroupBlockers:
-        """Planes and convex parts that block light of receivers.
+        """Spheres, planes and convex parts that block light of receivers.
 
         Args:
             body: The receivers' own; −1 if it is not known.
             of_bodies: The bodies that may block; by default all.
         """
+        spheres = self.group_spheres(self.bodies if of_bodies is None else of_bodies)
+        return self.shapes_around(body, of_bodies)._replace(spheres=spheres)
+
+    def shapes_around(self, body: int, of_bodies: Iterable[int] | None = None) -> GroupBlockers:
+        """As :meth:`around`, without the spheres."""
         return GroupBlockers(
             planes=self._planes_around(body, of_bodies),
             convex_parts=self._convex_parts_around(body, of_bodies),

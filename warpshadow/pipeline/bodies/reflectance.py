@@ -161,10 +161,16 @@ class Materials:
         body = self.merged_scene.scene.bodies[number]
         return not np.any(body.albedo if body.texture is None else body.texture)
 
-    def may_be_metal(self, number: int) -> bool:
-        """Whether a body that shines may be a metal: it is one in the scene, or a call says how metallic it is."""
-        is_given = self._inputs["metallic"].value()[number] is not self._of_scene["metallic"].value()[number]
-        return is_given or bool(np.any(self.merged_scene.scene.bodies[number].metallic))
+    @property
+    def metals(self) -> list[int]:
+        """Bodies that shine and may be metals: they are in the scene, or a call says how metallic they are."""
+        values, scene_values = (inputs["metallic"].value() for inputs in (self._inputs, self._of_scene))
+        bodies = self.merged_scene.scene.bodies
+        return [
+            number
+            for number in np.flatnonzero(self.merged_scene.is_glossy).tolist()
+            if values[number] is not scene_values[number] or np.any(bodies[number].metallic)
+        ]
 
     def replaced(self, replacements: Mapping[str, BodyArrays]) -> "Materials":
         """A copy with other arrays of some bodies, by name, checked; nodes of the others are shared.

@@ -92,8 +92,9 @@ class OutgoingRadiance:
     @functools.cached_property
     def texels(self) -> wp.array:
         """Radiosity of the flat bodies, vec3 of shape [batch, texel]."""
-        assert self.proxies.planes is not None
-        return find_texels(self.radiosity, self.patch_weights, self.proxies.planes.blockers)
+        planes = self.proxies.senders.planes
+        assert planes is not None
+        return find_texels(self.radiosity, self.patch_weights, planes.blockers)
 
 
 class BounceGatherer:
@@ -159,7 +160,7 @@ class BounceGatherer:
     def _from_planes(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array
     ) -> wp.array:
-        planes = outgoing.proxies.planes
+        planes = outgoing.proxies.senders.planes
         assert planes is not None
         self_plane = None if group.body is None else planes.index_of_body.get(group.body)
         if planes.blockers.count == (self_plane is not None):

@@ -287,7 +287,7 @@ class MovingBounces:
         self, make_visibility: Callable[..., TransferNode], proxies: Proxies, points: ShadingContext
     ) -> PatchSampleNodes:
         """Nodes of the patch samples of the bodies around points."""
-        senders, planes, spheres = proxies.senders, proxies.planes, points.spheres
+        senders, planes, spheres = proxies.senders, proxies.senders.planes, points.spheres
 
         def project(patch_samples: Receivers, visibility: list[PortionForBounces], *arguments: Any) -> PlacedProxies:
             return proxies.place(patch_samples, [portion.transmittance for portion in visibility], *arguments)

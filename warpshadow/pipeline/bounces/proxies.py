@@ -12,7 +12,7 @@ import warp as wp
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant
 from warpshadow.pipeline.bounces.cell_transmittance import CellTransmittance
-from warpshadow.pipeline.bounces.patches import SenderPlanes, Senders
+from warpshadow.pipeline.bounces.patches import Senders
 from warpshadow.pipeline.bounces.scene_overlays import find_overlays
 from warpshadow.pipeline.shading.transfers import join_rows
 from warpshadow.stages.bounces.projected_areas import find_projected_areas, tilt_normals_off_planes
@@ -47,11 +47,6 @@ class Proxies:
 
     def __init__(self, senders: Senders, merging: float):
         self.senders, self.merged_scene, self.merging = senders, senders.merged_scene, merging
-
-    @property
-    def planes(self) -> SenderPlanes | None:
-        """The flat bodies among them; None without any."""
-        return self.senders.planes
 
     @functools.cached_property
     def black_bodies(self) -> list[int]:
@@ -150,7 +145,7 @@ class Proxies:
             spheres: Centers and radii of all spheres.
             frames: Where flat bodies are.
         """
-        normals, planes, senders = patch_samples.normals, self.planes, self.senders
+        normals, planes, senders = patch_samples.normals, self.senders.planes, self.senders
         centers, radii = self.merged_scene.spheres_of(self.merged_scene.nonplanar_bodies, spheres)
         if planes is not None:
             numbers, points, device = self.nearest_spheres, patch_samples.points, normals.device

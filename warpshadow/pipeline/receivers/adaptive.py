@@ -54,8 +54,7 @@ def find_squares(
             seen = fragments_of_samples(fragments, probes[columns])
             probes_of_body = points_of_fragments(positions, normals, merged_scene.faces, seen, footprint_inputs)
             points, point_normals, footprints = probes_of_body
-            group_blockers = blockers.around(body)._replace(spheres=blockers.group_spheres(blockers.bodies))
-            group = Group(points, point_normals, group_blockers, footprints)
+            group = Group(points, point_normals, blockers.around(body), footprints)
             portions = [share_of_sharpest_light(portion) for portion in group.portions()]
             known = [portion for portion in portions if portion is not None]
             if known:

@@ -166,7 +166,7 @@ def find_portions(
         assert static_normals is not None
         moving = static_bodies.moving
         points_and_normals = static_bodies.receivers(receivers.static_vertices, static_normals)
-        group_blockers = blockers.around(of_bodies=moving)._replace(spheres=blockers.group_spheres(moving))
+        group_blockers = blockers.around(of_bodies=moving)
         yield from Group(*points_and_normals, group_blockers, cached_rows=cached_rows).portions()
         if not receivers.points.shape[1]:
             return
@@ -174,8 +174,7 @@ def find_portions(
     if receivers.spans:
         groups = _groups_by_body(receivers, blockers, self_lookups or {}, nearest_blockers, by_body)
     else:
-        group_blockers = blockers.around()._replace(spheres=blockers.group_spheres(blockers.bodies))
-        arrays = receivers.points, receivers.normals, group_blockers if receivers.points.size else GroupBlockers()
+        arrays = receivers.points, receivers.normals, blockers.around() if receivers.points.size else GroupBlockers()
         groups = iter([Group(*arrays, receivers.footprints, nearest_blockers=nearest_blockers)])
     for group in groups:
         yield from group.portions()
@@ -202,7 +201,7 @@ def _groups_by_body(
     def key_of(span: Span) -> GroupKey:
         body, lookup = span.body, self_lookups.get(span.body)
         blocks_alone = spheres is None or spheres.ranges.get(body) == (0, spheres.radii.shape[1])
-        group_blockers = blockers.around(body)._replace(
+        group_blockers = blockers.shapes_around(body)._replace(
             spheres=None if blocks_alone else clustered_spheres(),
             self_lookup=lookup,
             body_sides=blockers.body_sides if body >= 0 else None,

@@ -68,7 +68,7 @@ def mix_gloss(
     values = {name: _find_values(points, materials, name) for name in GLOSS_ARGUMENTS}
     roughness = values["roughness"]
 
-    has_metal = any(materials.may_be_metal(body) for body in np.flatnonzero(method.merged_scene.is_glossy).tolist())
+    has_metal = bool(materials.metals)
 
     def sample() -> Node:
         geometry = points.normals, points.vertices, points.cameras

@@ -56,8 +56,7 @@ class MirroredBodies:
             materials: Of the bodies.
             have_radiosity: Whether their radiosity is known.
         """
-        bodies, is_glossy = self._merged_scene.scene.bodies, self._merged_scene.is_glossy
-        metals = [number for number in np.flatnonzero(is_glossy).tolist() if materials.may_be_metal(number)]
+        bodies, is_glossy, metals = self._merged_scene.scene.bodies, self._merged_scene.is_glossy, materials.metals
         mirrors = tuple(
             number
             for number in metals
