@@ -11,7 +11,7 @@ import pytest
 import warpshadow as ws
 from demos import kinds, shapes
 from demos.benchmarks import scenes_of_all_kinds as bench
-from demos.references import Reference, Request, turned
+from demos.references import Reference, Request, by_rays, turned
 from warpshadow.pipeline.bounces import self_form_factors
 
 SMALL = 40  # pixels across
@@ -131,6 +131,20 @@ def test_a_reference_is_found_again_until_its_scene_changes(tmp_path):
         assert dataclasses.replace(request, **change).path() != request.path()
     settings = dataclasses.replace(scene, visibility=ws.Visibility(method="none"), supersampling=1)
     assert dataclasses.replace(request, scene=settings).path() == request.path()
+
+
+def test_samples_of_a_reference_share_no_receiver():
+    """Below a slat that shades the left sample of each third pixel, and not its middle, half of the light is left."""
+    sun = np.zeros((512, 1024, 3), np.float32)
+    sun[128, 512] = 1e5  # 45° high over +z
+    camera = ws.Camera.look_at((0, 1, 0), (0, 0, 0), up=(0, 0, -1), fov_y=90, size=16)
+    slats = [shapes.box((0.04, 0.001, 0.4), (2 / 16 * (column + 0.25) - 1, 0.3, 1.2)) for column in range(0, 16, 3)]
+    bodies = [ws.Body(ws.plane(4, 1), name="ground"), ws.Body(shapes.joined("slats", slats))]
+    scene = ws.Scene(bodies, ws.EnvironmentMap(sun), camera, supersampling=2)
+    row = by_rays(scene, 2048)[0, -1, :, 0]
+    light = row.max()
+    assert row[::3] == pytest.approx(np.full(6, light / 2), rel=0.1)
+    assert row[1::3] == pytest.approx(np.full(5, light), rel=0.1)
 
 
 # ---------------------------------------------------------------------------------------------- scenes
