@@ -7,7 +7,7 @@ import trimesh
 import warpshadow as ws
 from warpshadow.maths.adjacency import edges_of
 from warpshadow.maths.decimation import decimate
-from warpshadow.maths.polygons import join_triangles
+from warpshadow.maths.polygons import merge_triangles
 
 
 def dome(level):
@@ -98,14 +98,14 @@ def test_edges_of_three_triangles_stay():
 
 def test_triangles_are_joined_to_convex_polygons_that_cover_them():
     grid = ws.plane(2.0, 6)
-    (square,) = join_triangles(grid.positions.astype(np.float64), grid.faces, 0.01)
+    (square,) = merge_triangles(grid.positions.astype(np.float64), grid.faces, 0.01)
     assert len(square) == 4
 
 
 def test_polygons_are_nearly_plane_and_share_sides():
     """A polygon that bends would leap from side to side of a receiver that passes its plane."""
     points, triangles = dome(3)
-    polygons = join_triangles(points, decimate(points, triangles, 0.02), 0.04)
+    polygons = merge_triangles(points, decimate(points, triangles, 0.02), 0.04)
     assert len(polygons) < len(decimate(points, triangles, 0.02))
     for polygon in polygons:
         corners = points[polygon] - points[polygon].mean(axis=0)

@@ -1,4 +1,4 @@
-"""Triangles: their normals, solid angles and edges, which of them share one, and which vertices are at one place."""
+"""Triangles: normals, solid angles, edges, adjacency, and vertices that share a position."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ _NOT_MANIFOLD = -2
 
 
 def area_normals(corners: np.ndarray) -> np.ndarray:
-    """Normals of triangles, twice as long as their areas, given their corners [triangle, 3, 3]; shape [triangle, 3]."""
+    """Normals of triangles, of twice their area in length, given corners [triangle, 3, 3]; shape [triangle, 3]."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def solid_angles(corners: np.ndarray) -> np.ndarray:
-    """Solid angles that triangles take, seen from the origin [Van Oosterom and Strackee 1983].
+    """Solid angles of triangles from the origin [Van Oosterom and Strackee 1983].
 
     Args:
         corners: float64 of shape [triangle, 3, 3].
@@ -30,7 +30,7 @@ def solid_angles(corners: np.ndarray) -> np.ndarray:
 
 
 def edges_of(triangles: np.ndarray) -> np.ndarray:
-    """Edges of triangles, all from first corners first, shape [3 triangle, 2]."""
+    """Directed edges of triangles, shape [3 triangle, 2]: edges from all first corners come first."""
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
@@ -39,12 +39,12 @@ def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np
 
     Args:
         faces: Indices of positions, shape [face, 3]: faces are joined where edges share positions, whatever the uvs.
-        positions: Vertices, shape [vertex, 3]; when given, vertices at the same place count as one, as a mesh needs
-            whose faces have vertices of their own.
+        positions: Vertices, shape [vertex, 3]; when given, vertices at one position count as one, for
+            meshes whose faces share no vertices.
     Returns:
-        Face across the edges opposite to corners 0, 1 and 2, int32 of shape [face, 3]; −1 at a border, −2 where more
-        than two faces meet. Both are silhouettes from everywhere. A face with two corners at one place is passed over
-        and has no neighbors itself.
+        Face across the edges opposite to corners 0, 1 and 2, int32 of shape [face, 3]; −1 at a boundary, −2 at
+        non-manifold edges. Both are silhouettes from everywhere. Degenerate faces, with two corners at one position,
+        neither are neighbors nor have any.
     """
     check.shape("faces", faces.shape, ("face", 3))
     faces = faces.astype(np.int64) if positions is None else number_positions(positions)[faces]
@@ -68,7 +68,7 @@ def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np
 
 
 def number_positions(positions: np.ndarray) -> np.ndarray:
-    """Number the distinct positions of vertices, or rows of any width: equal ones share a number, shape [vertex]."""
+    """Number distinct positions, or rows of any width: equal ones share a number, shape [vertex]."""
     permutation = np.lexsort(positions.T)
     is_new = (np.diff(positions[permutation], axis=0) != 0).any(axis=1)
     position_ids = np.zeros(len(positions), np.int64)

@@ -4,16 +4,16 @@ import numpy as np
 
 
 def connected_components(ends: np.ndarray, other_ends: np.ndarray, count: int) -> np.ndarray:
-    """Number of the component that each node of a graph is in, from 0, in the order of their first nodes.
+    """Label the connected components of a graph from 0, in the order of their first nodes.
 
-    Components take over the lowest label of their neighbors, and halve in number at least in each round. (SciPy's
-    takes 0.2 s to be imported, which a still needs for nothing else.)
+    In each round a component takes the lowest label of its neighbors, which at least halves their number. (SciPy's
+    takes 0.2 s to import, and stills need nothing else of it.)
 
     Args:
-        ends, other_ends: Nodes that links join, shape [link].
+        ends, other_ends: Nodes of each edge, shape [edge].
         count: Number of nodes.
     Returns:
-        Shape [count].
+        Label of each node, shape [count].
     """
     label = np.arange(count)
     while (label[ends] != label[other_ends]).any():

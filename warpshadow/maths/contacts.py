@@ -1,14 +1,13 @@
-"""Contacts: where bodies touch so that a narrow gap opens around, as around the foot of a ball.
+"""Contacts: where bodies touch at a point or along a line, with a narrow gap around, as a ball on a ground.
 
-Light in such a gap falls with a power of the distance r to the contact, so patches there are to be about as wide as r.
-They are
+Light in the gap falls with a power of the distance r to the contact, so patches there should be about as wide as r.
+Their density is
 
     1 + w L² / (r² + s²),  s = 0.05 L
 
-times as dense as elsewhere, where L is half the size of the body; of two bodies that are not flat, of the smaller one.
-:func:`warpshadow.stages.patches.find_patches` chooses w. Faces that lie on each other, as a box's bottom on a
-ground, have no such gap; nor has an edge that a box stands on, or a body that sticks in another: there surfaces are not
-parallel.
+times that elsewhere, where L is half the size of the body; of two bodies that are not flat, of the smaller one.
+:func:`warpshadow.stages.patches.find_patches` chooses w. Faces that lie on each other, as a box on a ground, have
+no such gap; nor has an edge that a box stands on, or a body that penetrates another: there surfaces are not parallel.
 """
 
 from collections.abc import Sequence
@@ -16,12 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-_CORE_RADIUS = 0.05  # s in units of L: nearer to a contact nothing gets finer
-MAX_GAP = 0.02  # the widest gap of bodies that touch, in units of L …
-_EXTRA_GAP = 0.002  # … and how much wider it is where they touch, too
-_MAX_AREA = 0.03  # share of its area in which a body touches another, at most: more is face on face
-_MAX_POINTS = 32  # points of a contact
-_POINT_EXTENT = 0.5  # extent of a contact that counts as a point, in units of L, at most
+_CORE_RADIUS = 0.05  # s in units of L: nearer to a contact the density is constant
+MAX_GAP = 0.02  # widest gap of bodies that count as touching, in units of L …
+_EXTRA_GAP = 0.002  # … and points of a contact have gaps up to this much wider than the narrowest
+_MAX_AREA = 0.03  # largest share of its area in which a body touches another: more is face on face
+_MAX_POINTS = 32  # maximum number of points of a contact
+_POINT_EXTENT = 0.5  # largest extent of a contact that counts as a point, in units of L
 
 
 class Contact(NamedTuple):
@@ -32,19 +31,19 @@ class Contact(NamedTuple):
 
     @property
     def is_point(self) -> bool:
-        """Whether it is about a point, not a line."""
+        """Whether the contact is a point, not a line."""
         return bool(np.ptp(self.points, axis=0).max() < _POINT_EXTENT * self.half_size)
 
 
 def touching_numbers(gaps: np.ndarray, areas: np.ndarray, half_size: float) -> np.ndarray:
-    """Which points of a body touch another.
+    """Find the points of a body that touch another.
 
     Args:
         gaps: Their distances to the other body; infinite where it is far away or not parallel, shape [point].
         areas: Parts of the body's surface around them, shape [point].
         half_size: L, of the smaller of both bodies that is not flat.
     Returns:
-        Their numbers, spread over all that touch, ascending; none where bodies are apart, or touch face on face.
+        Indices of an even sample of the points that touch, ascending; none if bodies are apart or touch face on face.
     """
     nearest = gaps.min(initial=np.inf)
     if nearest > MAX_GAP * half_size:
@@ -56,7 +55,7 @@ def touching_numbers(gaps: np.ndarray, areas: np.ndarray, half_size: float) -> n
 
 
 def contact_excess(points: np.ndarray, radii: np.ndarray | float, contacts: Sequence[Contact]) -> np.ndarray:
-    """L² / (r² + s²) of the nearest contacts, which w times is the density that they add.
+    """L² / (r² + s²) of the nearest contacts; times w, it is the density that they add.
 
     Args:
         points: Middles of pieces of a surface, shape [piece, 3].

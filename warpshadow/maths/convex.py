@@ -1,6 +1,7 @@
-"""Convex parts of a mesh: its closed convex pieces, such as the boxes and rods of furniture, convex prisms into which
-other pieces are cut, such as a thick wall with a window, segments of bent rods, and panels of its sheets and of the
-outer layers of its thin walls.
+"""Convex decomposition of a mesh.
+
+Parts are closed convex pieces, such as the boxes and rods of furniture; convex prisms of other pieces, such as a thick
+wall with a window; segments of bent rods; panels of sheets and of the outer layers of thin walls.
 """
 
 from collections.abc import Sequence
@@ -15,54 +16,55 @@ from warpshadow.maths.panels import MAX_FLAT_PANELS_OF, MAX_PANELS_OF, find_pane
 from warpshadow.maths.thin_walls import find_layer
 from warpshadow.maths.tubes import MAX_SEGMENTS, find_tube
 
-MAX_FACES = 64  # faces of a part at most; a cylinder of 48 sides has 50
+MAX_FACES = 64  # of a part; a cylinder of 48 sides has 50
 
 MAX_PRISMS = 64
-"""Prisms into which a piece is cut at most. A wall with a door and a round window of 48 edges has 49: an image of 64²,
+"""Maximum number of prisms of a piece. A wall with a door and a round window of 48 edges has 49: an image of 64²,
 with the sun behind it, is 2.2% off. Past 1024 spheres, between which the sun leaks, it is 6.4% off, in 0.4 times the
 time, after a fit of 18 s. A gear with five round holes has 300: as many spheres are faster."""
 
-_FEW_PRISMS = 32  # up to which a piece is cut into them although it is a tube, too: a washer of 48 sides is 24 segments
+_FEW_PRISMS = 32  # a tube with more prisms has segments instead: a washer of 48 sides has 24 segments
 
-_MAX_AXES = 8  # directions in which a piece may be a prism, of its largest faces
+_MAX_AXES = 8  # normals of the largest faces that are tried as the axis of a prism
 
-_MAX_TRIANGLES = 16 * MAX_FACES  # triangles of a solid at most: its faces may be divided
+_MAX_TRIANGLES = 16 * MAX_FACES  # of a solid, whose faces may be subdivided
 
 _FLATNESS = 1e-4
-"""Height over the size of the part up to which vertices lie in the plane of a face, and on a straight edge; and
-1 − cos α of the angle between neighboring triangles up to which they are of one face."""
+"""Vertices lie in the plane of a face, and on a straight edge, up to this distance over the size of the part;
+neighboring triangles are coplanar up to this 1 − cos α."""
 
 _MAX_HOLES = 0.05
-"""Border of a thin wall at most, over its size, such as a pinhole where a lathe's profile does not reach the axis."""
+"""Maximum length of the boundary of a thin wall, over its size. A lathe's profile that does not reach the axis leaves a
+pinhole."""
 
-_TWIST = 5e-3  # the same of faces of segments of bent tubes, whose sides twist
+_TWIST = 5e-3  # the flatness of segments of bent tubes, whose sides twist
 
 
 class ConvexPart(NamedTuple):
-    """A closed convex piece of a mesh, without the edges inside its faces; or a panel, whose faces are its sides."""
+    """A closed convex solid, coplanar triangles merged into faces; or a panel, whose two faces are its sides."""
 
-    corners: np.ndarray  # vertices of the mesh at its corners, int of shape [corner]
+    corners: np.ndarray  # indices of vertices of the mesh, int of shape [corner]
     faces: np.ndarray
-    """Three corners of each face, counterclockwise from outside, numbers among the corners, shape [face, 3]."""
+    """Three corners of each face, counterclockwise from outside, indices of corners, shape [face, 3]."""
     edges: np.ndarray  # ends of each edge, indices of corners, and the faces to its left and right, [edge, 4]
     is_seam: bool = False
-    """Whether it is the face that two prisms share: seen at a slant both cover it, so it is to be taken off."""
-    piece: int = 0  # number of the piece of the mesh, from 0. Parts of one piece are beside each other.
+    """Whether it is a face that two prisms share. Both cover it when seen at a slant, so its coverage is subtracted."""
+    piece: int = 0  # index of the piece of the mesh. Parts of one piece do not overlap.
     gap: float = 0.0
-    """Distance of the mesh from a part that stands in for a bent piece of it, at most, over the radius of the part."""
+    """Largest distance of the mesh from a part that approximates a bent piece, over the radius of the part."""
 
 
 def is_panel(part: ConvexPart) -> bool:
-    """Whether a part is a panel of a sheet or a thin wall, which encloses nothing."""
+    """Whether a part is a panel, which encloses no volume."""
     return len(part.faces) == 2 and not part.is_seam
 
 
 def is_convex(positions: np.ndarray, faces: np.ndarray) -> bool:
-    """Whether a closed mesh encloses a convex solid: it fills its convex hull, but for a ten-thousandth.
+    """Whether a closed mesh is convex: its volume is that of its convex hull, up to a ten-thousandth.
 
     Args:
         positions: Vertices, shape [vertex, 3].
-        faces: Triangles that wind alike, shape [face, 3].
+        faces: Consistently wound triangles, shape [face, 3].
     """
     from scipy.spatial import ConvexHull
 
@@ -75,21 +77,20 @@ def is_convex(positions: np.ndarray, faces: np.ndarray) -> bool:
 def find_convex_parts(
     positions: np.ndarray, faces: np.ndarray, *, flat_panels: bool = False
 ) -> list[ConvexPart] | None:
-    """Cut a mesh into convex parts.
+    """Decompose a mesh into convex parts.
 
     Args:
-        positions: Vertices, shape [vertex, 3]; vertices at one place count as one.
-        faces: Triangles that wind alike, shape [face, 3].
-        flat_panels: Whether panels are flat: no bent sheet has any.
+        positions: Vertices, shape [vertex, 3]; vertices at one position count as one.
+        faces: Consistently wound triangles, shape [face, 3].
+        flat_panels: Whether panels must be flat, so that bent sheets have none.
 
     Returns:
-        The parts, which may touch and overlap: for each closed piece of the mesh a solid, or the prisms into which it
-        is cut if it is one, with holes or without, or the segments of a bent tube; panels for each open one. They come
-        by pieces, and in each the seams come last. Panels of sheets that share edges are of one piece. A piece around a
-        thin wall (:mod:`.thin_walls`), closed but for pinholes, has one-sided panels: those for receivers outside are
-        one piece, those for receivers inside another, as a receiver may see both walls of a mug behind each other. None
-        where a closed piece is hollow or curved otherwise, where a part has more than 64 faces, or where there are more
-        than 64 prisms of a piece, 128 segments of all tubes, or 352 panels (64 flat ones).
+        The parts, sorted by piece, in each the seams last; parts of different pieces may overlap. A closed piece is a
+        convex solid, prisms (if it is a prism itself, with holes or without), or segments of a bent tube. An open piece
+        is panels; sheets that share edges are one piece. A thin wall (:mod:`.thin_walls`), closed but for pinholes, has
+        one-sided panels: those for receivers outside are one piece, those for receivers inside another, since a
+        receiver may see both walls of a mug. None if a closed piece is hollow or curved otherwise, if a part has more
+        than 64 faces, or with more than 64 prisms of a piece, 128 segments of all tubes, or 352 panels (64 flat ones).
     """
     _, first, vertex = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     triangles = vertex.reshape(-1)[faces]
@@ -101,8 +102,8 @@ def find_convex_parts(
     piece = _pieces(triangles)
     for number in range(piece.max() + 1):
         piece_triangles = triangles[piece == number]
-        border, parts_of_piece = _border_share(points, piece_triangles), None
-        if not border:
+        boundary, parts_of_piece = _boundary_length(points, piece_triangles), None
+        if not boundary:
             solid = _solid(points, piece_triangles)
             parts_of_piece = [solid] if solid else _prisms(points, piece_triangles)
             if parts_of_piece is None or _solid_count(parts_of_piece) > _FEW_PRISMS:
@@ -112,11 +113,11 @@ def find_convex_parts(
         if parts_of_piece is not None:
             pieces.append(parts_of_piece)
             continue
-        has_layer = border <= _MAX_HOLES and not flat_panels
+        has_layer = boundary <= _MAX_HOLES and not flat_panels
         layer = find_layer(points, piece_triangles) if has_layer else None
         if layer is not None:
             layers.append(layer)
-        elif border:
+        elif boundary:
             sheets.append(piece_triangles)
         else:
             return None
@@ -138,12 +139,12 @@ def find_convex_parts(
 
 
 def _solid_count(parts: Sequence[ConvexPart]) -> int:
-    """Number of parts that are no seams."""
+    """Number of parts without seams."""
     return sum(not part.is_seam for part in parts)
 
 
 def _pieces(triangles: np.ndarray) -> np.ndarray:
-    """Number of the piece of each triangle; where pieces share an edge, triangles next to each other go together."""
+    """Index of the piece of each triangle; at non-manifold edges, adjacent triangles in the list are joined."""
     edges, count = np.sort(edges_of(triangles), axis=1), len(triangles)
     _, edge, counts = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
     permutation = np.lexsort((np.arange(len(edges)) % count, edge.reshape(-1)))
@@ -152,7 +153,7 @@ def _pieces(triangles: np.ndarray) -> np.ndarray:
 
 
 def _groups(sheets: list[np.ndarray]) -> np.ndarray:
-    """Number of the group of each sheet; sheets that share edges, such as walls that meet in a T, are one group."""
+    """Index of the group of each sheet; sheets that share edges, such as walls that meet in a T, are one group."""
     edges, none = [np.unique(np.sort(edges_of(sheet), axis=1), axis=0) for sheet in sheets], np.zeros((0, 2), int)
     sheet = np.repeat(np.arange(len(sheets)), list(map(len, edges)))
     _, edge = np.unique(np.concatenate([none, *edges]), axis=0, return_inverse=True)
@@ -161,15 +162,15 @@ def _groups(sheets: list[np.ndarray]) -> np.ndarray:
     return connected_components(sheet[permutation[:-1][is_shared]], sheet[permutation[1:][is_shared]], len(sheets))
 
 
-def _border_share(points: np.ndarray, triangles: np.ndarray) -> float:
-    """Length of the border of triangles over their size; 0 where they are closed."""
+def _boundary_length(points: np.ndarray, triangles: np.ndarray) -> float:
+    """Length of the boundary of triangles over their size; 0 if they are closed."""
     edges, counts = np.unique(np.sort(edges_of(triangles), axis=1), axis=0, return_counts=True)
     ends = points[edges[counts % 2 == 1]]
     return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum() / np.ptp(points[triangles], axis=(0, 1)).max())
 
 
 def _panel(corners: np.ndarray) -> ConvexPart:
-    """A panel, given its corners in order."""
+    """Make a panel of its corners in order."""
     count = len(corners)
     one_third, two_thirds = count // 3, 2 * count // 3
     sides = np.array([[0, one_third, two_thirds], [0, two_thirds, one_third]])
@@ -181,7 +182,7 @@ def _panel(corners: np.ndarray) -> ConvexPart:
 def _one_sided_panels(
     points: np.ndarray, triangles: np.ndarray, polygons: Sequence[np.ndarray]
 ) -> tuple[list[ConvexPart], list[ConvexPart]]:
-    """Panels that block light of receivers outside a layer alone, and others of receivers inside."""
+    """Make one-sided panels of a layer: some block for receivers outside, the others for receivers inside."""
     corners = points[triangles]
     normals = np.repeat(area_normals(corners), 3, axis=0)
     vertex_normals = np.zeros_like(points)
@@ -193,13 +194,13 @@ def _one_sided_panels(
         outside = polygon if normal @ vertex_normals[polygon].sum(axis=0) > 0 else polygon[::-1]
         for side, corners_of_side in zip(panels, (outside, outside[::-1]), strict=True):
             panel = _panel(corners_of_side)
-            panel.faces[1] = 0  # nobody sees it
+            panel.faces[1] = 0  # degenerate: its back is never seen
             side.append(panel)
     return panels
 
 
 def _solid(points: np.ndarray, triangles: np.ndarray, flatness: float = _FLATNESS) -> ConvexPart | None:
-    """The convex solid that triangles enclose; None where they enclose none."""
+    """The convex solid that triangles enclose; None if it is not convex."""
     if len(triangles) > _MAX_TRIANGLES:
         return None
     edges, count = edges_of(triangles), len(triangles)
@@ -236,7 +237,7 @@ def _solid(points: np.ndarray, triangles: np.ndarray, flatness: float = _FLATNES
         if f < g:
             runs.setdefault((f, g), []).append([a, b])
     straight = []
-    for (f, g), run in runs.items():  # pieces of a straight edge follow each other
+    for (f, g), run in runs.items():  # collinear edges must form one chain
         starts, ends = map(set, zip(*run, strict=True))
         if len(starts - ends) != 1 or len(ends - starts) != 1:
             return None
@@ -245,12 +246,12 @@ def _solid(points: np.ndarray, triangles: np.ndarray, flatness: float = _FLATNES
             return None
         straight.append([begin, end, f, g])
     straight_edges = np.array(straight)
-    straight_edges[:, :2] = np.searchsorted(used_vertices, straight_edges[:, :2])  # numbers among the corners
+    straight_edges[:, :2] = np.searchsorted(used_vertices, straight_edges[:, :2])  # to indices of corners
     return ConvexPart(used_vertices, np.searchsorted(used_vertices, triangles[largest_faces]), straight_edges)
 
 
 def _prisms(points: np.ndarray, triangles: np.ndarray) -> list[ConvexPart] | None:
-    """The convex prisms into which the prism that triangles enclose is cut; None where they enclose none."""
+    """Convex prisms of the prism that triangles enclose; None if it is no prism."""
     corners = points[triangles]
     normals = area_normals(corners)
     lengths = np.linalg.norm(normals, axis=1)
@@ -269,7 +270,7 @@ def _prisms(points: np.ndarray, triangles: np.ndarray) -> list[ConvexPart] | Non
 def _prisms_along(
     axis: np.ndarray, points: np.ndarray, triangles: np.ndarray, normals: np.ndarray
 ) -> list[ConvexPart] | None:
-    """The convex prisms with bases across an axis."""
+    """Convex prisms along an axis."""
     from scipy.spatial import cKDTree
 
     used_vertices = np.unique(triangles)
@@ -300,7 +301,7 @@ def _prisms_along(
 
 
 def _segments(points: np.ndarray, triangles: np.ndarray, maximum: int) -> list[ConvexPart] | None:
-    """The straight segments of the tube that triangles enclose; None where they enclose none."""
+    """Straight segments of the tube that triangles enclose; None if it is no tube."""
     tube = find_tube(points, triangles, maximum)
     if tube is None:
         return None
@@ -318,7 +319,7 @@ def _segments(points: np.ndarray, triangles: np.ndarray, maximum: int) -> list[C
 
 
 def _shared_sides(plane: np.ndarray, polygons: Sequence[np.ndarray]) -> list[tuple[int, int]]:
-    """Where pairs of polygons in a plane touch along their sides: the points at both ends, numbers."""
+    """Indices of the points at both ends of each line along which two polygons in a plane touch."""
     ends = np.concatenate([np.stack([polygon, np.roll(polygon, -1)], axis=1) for polygon in polygons])
     starts, side_vectors = plane[ends[:, 0]], plane[ends[:, 1]] - plane[ends[:, 0]]
     lengths = np.linalg.norm(side_vectors, axis=1)
@@ -340,7 +341,7 @@ def _shared_sides(plane: np.ndarray, polygons: Sequence[np.ndarray]) -> list[tup
 
 
 def _prism(top: np.ndarray, bottom: np.ndarray) -> ConvexPart:
-    """A prism, given the corners of its top, counterclockwise from above, and the corners below them."""
+    """Make a prism of the corners of its top, counterclockwise from above, and the corners below them."""
     count = len(top)
     begin, one_third = np.arange(count), count // 3
     end = np.roll(begin, -1)

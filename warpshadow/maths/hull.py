@@ -1,8 +1,8 @@
 """Convex hulls of bodies whose pieces stand side by side, such as slats, pickets, crates, and keys of a keyboard.
 
-Seen from anywhere, such pieces together cover about min(Σ_pieces h, h_hull) of a disc of directions, of which each
-covers h and their convex hull h_hull: exactly so much if none is before another, or if they leave no gap. Trunks of a
-wood, of which many are behind each other, cover less. Rays tell.
+A piece covers the share h of a disc of directions, and the convex hull of all pieces h_hull. Together the pieces cover
+about min(Σ_pieces h, h_hull). That is exact where no piece hides another, or where they leave no gap. Trees of a
+forest, many of which hide others, cover less. Rays decide.
 """
 
 from collections.abc import Sequence
@@ -14,13 +14,14 @@ from warpshadow.maths.convex import MAX_FACES, ConvexPart, is_panel
 from warpshadow.maths.directions import cell_radius
 
 MAX_ERROR = 0.03
-"""Mean error up to which a hull is taken, if it also is at most half of that of independent pieces. Measured, and
-that of independent ones: strips that touch 0.000 (0.146), pickets 0.002 (0.104), crates 0.003 (0.018), keys of a
-keyboard 0.009 (0.146), a blind 0.013 (0.112), slats of a shutter 0.021 (0.117), stairs 0.024 (0.120). Not taken: a
-table 0.015 (0.011), bricks 0.032 (0.157), a fence with rails 0.033 (0.095), books 0.042 (0.218), a chair 0.059 (0.034),
-a city 0.095 (0.051). With its hull the shadow of that fence is 4% too dark, as pieces 2% too bright."""
+"""A hull is used if the mean error of its bound is at most this, and at most half of that of independent pieces.
+Measured, in parentheses with independent pieces: strips that touch 0.000 (0.146), pickets 0.002 (0.104), crates 0.003
+(0.018), keys of a keyboard 0.009 (0.146), a blind 0.013 (0.112), slats of a shutter 0.021 (0.117), stairs 0.024
+(0.120). Not used: a table 0.015 (0.011), bricks 0.032 (0.157), a fence with rails 0.033 (0.095), books 0.042 (0.218), a
+chair 0.059 (0.034), a city 0.095 (0.051). With its hull the shadow of that fence is 4% too dark, as pieces 2% too
+bright."""
 
-_RECEIVERS, _DISCS, _RAYS = 48, 8, 32  # points around the hull, discs that each sees, and rays to each
+_RECEIVERS, _DISCS, _RAYS = 48, 8, 32  # points around the hull, discs of directions of each, rays of each disc
 _DISTANCES = 0.4, 1.4  # of these points from the middle, over the hull's extent
 _RADIUS = cell_radius(128)  # of discs
 
@@ -33,8 +34,8 @@ def find_hull(positions: np.ndarray, parts: Sequence[ConvexPart]) -> ConvexPart 
         parts: Its parts, from :func:`.find_convex_parts`.
 
     Returns:
-        The hull; None of fewer than two pieces, of other pieces than convex solids, where it has more than
-        :data:`.convex.MAX_FACES` faces, or where its bound is off: see :data:`MAX_ERROR`.
+        The hull; None for fewer than two pieces, if one is no convex solid, if the hull has more than
+        :data:`.convex.MAX_FACES` faces, or if its bound is off: see :data:`MAX_ERROR`.
     """
     if len(parts) < 2 or any(part.is_seam or is_panel(part) for part in parts):
         return None
@@ -44,7 +45,7 @@ def find_hull(positions: np.ndarray, parts: Sequence[ConvexPart]) -> ConvexPart 
 
 
 def _hull(points: np.ndarray, corners: np.ndarray) -> ConvexPart:
-    """The convex hull of some of the points; triangles of one plane are a face."""
+    """The convex hull of some of the points, coplanar triangles merged into faces."""
     from scipy.spatial import ConvexHull
 
     hull = ConvexHull(points[corners])
@@ -63,7 +64,7 @@ def _hull(points: np.ndarray, corners: np.ndarray) -> ConvexPart:
 
 
 def _is_close(points: np.ndarray, parts: Sequence[ConvexPart]) -> bool:
-    """Whether min(Σ h, h_hull) is near the share that the parts cover, by rays in discs; the last part is the hull."""
+    """Whether min(Σ h, h_hull) is near the share that rays find covered in random discs; the last part is the hull."""
     rng, corners = np.random.default_rng(0), points[parts[-1].corners]
     distances = np.ptp(corners, axis=0).max() * rng.uniform(*_DISTANCES, (_RECEIVERS, 1, 1))
     outward = rng.normal(size=(_RECEIVERS, 1, 3))
@@ -83,7 +84,7 @@ def _is_close(points: np.ndarray, parts: Sequence[ConvexPart]) -> bool:
 
 
 def _are_hit(faces: np.ndarray, origins: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Whether rays meet a convex solid, given three corners of each of its faces, [face, 3, 3]."""
+    """Whether rays hit a convex solid, given three corners of each of its faces, [face, 3, 3]."""
     enter, leave = np.zeros(rays.shape[:-1]), np.full(rays.shape[:-1], np.inf)
     for normal, corner in zip(area_normals(faces), faces[:, 0], strict=True):
         speed, height = rays @ normal, (origins - corner) @ normal

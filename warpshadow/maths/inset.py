@@ -1,26 +1,26 @@
-"""Inset: vertices on the borders of flat parts of a mesh, moved into these parts, off the faces that border on them.
+"""Inset: boundary vertices of flat regions of a mesh, moved inward, off adjacent faces.
 
-A vertex where walls meet lies in the planes of all of them. Which side of another wall it is on, to rays that leave
-there, would be a matter of rounding or of winding. A little farther inside its own wall it is on the side of that wall.
+A vertex where walls meet lies in the planes of all of them. For rays that leave it, rounding or winding would decide on
+which side of another wall it is. Moved a little into its own wall, it is on the right side of the others.
 """
 
 import numpy as np
 
 from warpshadow.maths.adjacency import area_normals
 
-_SHARE = 1e-3  # of the way to the middles of the faces around a vertex
-_ROUNDING = 2.0**-16  # distance at least, as a share of the largest coordinate: rays take less for none
-_FLATNESS = 1e-6  # 1 − cosine between the faces around a vertex, up to which they are flat
+_SHARE = 1e-3  # of the distance to the mean centroid of the faces of a vertex
+_ROUNDING = 2.0**-16  # minimum distance over the largest coordinate: rays do not resolve less
+_FLATNESS = 1e-6  # faces of a vertex are coplanar up to this 1 − cosine
 
 
 def inset_vertices(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Move vertices towards the middles of the faces around them, where these lie in one plane.
+    """Move vertices whose faces are coplanar towards the centroids of these faces.
 
     Args:
         positions: Shape [vertex, 3].
-        faces: Indices of vertices, shape [face, 3]; faces with vertices of their own have borders of their own.
+        faces: Indices of vertices, shape [face, 3]; faces that share no vertices are regions of their own.
     Returns:
-        Positions, float32 of shape [vertex, 3]; those of vertices on bent surfaces are the same.
+        Positions, float32 of shape [vertex, 3]; vertices on bent surfaces stay.
     """
     points = np.asarray(positions, np.float64)
     corners = points[faces]
@@ -32,12 +32,12 @@ def inset_vertices(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     offsets, first_normals = np.zeros_like(points), np.zeros_like(points)
     counts, is_flat = np.bincount(faces.ravel(), minlength=len(points)), np.ones(len(points), bool)
     for corner in faces.T:
-        first_normals[corner] = normals  # of any of its faces
+        first_normals[corner] = normals  # of any face of the vertex
     for corner in faces.T:
         np.add.at(offsets, corner, middles - points[corner])
         is_flat[corner[np.abs((first_normals[corner] * normals).sum(axis=1)) < 1 - _FLATNESS]] = False
     offsets /= np.maximum(counts, 1)[:, None]
-    # into the tangent plane, so that points stay in surfaces that are all but flat
+    # projected onto the tangent plane, so that points stay in nearly flat surfaces
     offsets -= (offsets * first_normals).sum(axis=1, keepdims=True) * first_normals
     distances = np.linalg.norm(offsets, axis=1)
     smallest = _ROUNDING * np.abs(points[faces]).max(initial=0.0)

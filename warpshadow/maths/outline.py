@@ -1,25 +1,25 @@
-"""Outlines: the edges around triangles of a plane and around their holes, and the convex polygons that they enclose."""
+"""Outlines: the boundary edges of triangles in a plane, those of holes included, and their convex decomposition."""
 
 import numpy as np
 
 _STRAIGHT = 1e-5
-"""Distance from the line through its neighbors, over the size of the outline, up to which a corner is none; and the
-angle [rad] up to which a corner of a polygon is straight."""
+"""Corners are straight up to this distance from the line through their neighbors, over the size of the outline; corners
+of a polygon up to this angle [rad]."""
 
 _SLIVER = 1e-7  # area of a triangle, over the squared size of all, up to which rounding may turn it over
 
 
 def find_outline(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Find the edges that the triangles of a plane have not in common.
+    """Find the boundary edges of triangles in a plane.
 
     The outline of a sheet does not depend on how it is triangulated. Where triangles overlap, their outlines do, too.
 
     Args:
         points: Float64 of shape [point, 2], no two at one place.
-        triangles: Of any winding, shape [triangle, 3]; slivers wind as most do, and those with a corner twice have no
-            part in it.
+        triangles: Of any winding, shape [triangle, 3]; slivers are taken to wind as most do, and triangles
+            with a repeated corner do not count.
     Returns:
-        Points where each edge begins and ends, with the triangles to its left, int of shape [edge, 2].
+        Begin and end of each edge, with the triangles to its left, indices of points, int of shape [edge, 2].
     """
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     areas = _cross(b - a, c - a)
@@ -31,11 +31,11 @@ def find_outline(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     excess = np.bincount(number.reshape(-1), np.where(begins < edge_ends, 1, -1), pairs.shape[1]).astype(int)
     excess[pairs[0] == pairs[1]] = 0
     directed_edges = np.where(excess > 0, pairs, pairs[::-1])
-    return _without_straight(points, np.repeat(directed_edges, np.abs(excess), axis=1).T)
+    return _without_collinear(points, np.repeat(directed_edges, np.abs(excess), axis=1).T)
 
 
-def _without_straight(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Join edges at corners that are none."""
+def _without_collinear(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Merge collinear edges."""
     outgoing: dict[int, list[int]] = {}
     incoming: dict[int, list[int]] = {}
     for begin, end in edges.tolist():
@@ -62,7 +62,7 @@ def _without_straight(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def is_convex(edges: np.ndarray) -> bool:
-    """Whether no corner of an outline, float64 of shape [edge, 2, 2], lies to the right of an edge."""
+    """Whether an outline, float64 of shape [edge, 2, 2], is convex: no corner lies to the right of an edge."""
     begins, lines = edges[:, 0], edges[:, 1] - edges[:, 0]
     heights = _cross(lines[:, None], begins - begins[:, None])
     size = np.ptp(edges, axis=(0, 1)).max(initial=0.0)
@@ -70,18 +70,19 @@ def is_convex(edges: np.ndarray) -> bool:
 
 
 def cut_outline(points: np.ndarray, edges: np.ndarray, maximum: int) -> list[np.ndarray] | None:
-    """Cut the inside of an outline into convex polygons, by lines between its corners.
+    """Decompose the inside of an outline into convex polygons, by diagonals between its corners.
 
-    Each line begins at a reflex corner. It goes to one from which on that is reflex no more, to another reflex one if
-    it can be, else to the nearest. Lines that no corner needs any more are left out [Hertel and Mehlhorn 1983].
+    Each diagonal begins at a reflex corner. It ends at a corner that leaves no reflex angle; among these at another
+    reflex corner if there is one, else at the nearest. Diagonals that turn out to be redundant are removed [Hertel and
+    Mehlhorn 1983].
 
     Args:
         points: Float64 of shape [point, 2].
         edges: Of the outline, shape [edge, 2], with the inside to their left.
-        maximum: Number of polygons at most.
+        maximum: Maximum number of polygons.
     Returns:
-        Corners of each polygon, numbers of points counterclockwise, int of shape [corner]; None where there are more,
-        or where the outline touches or crosses itself.
+        Corners of each polygon, indices of points counterclockwise, int of shape [corner]; None if more polygons are
+        needed, or if the outline touches or crosses itself.
     """
     next_vertex, previous_vertex = dict(edges.tolist()), dict(edges[:, ::-1].tolist())
     if not len(next_vertex) == len(previous_vertex) == len(edges):
@@ -91,22 +92,23 @@ def cut_outline(points: np.ndarray, edges: np.ndarray, maximum: int) -> list[np.
     }
     if len(reflex) > 2 * maximum:
         return None
-    cuts = _Cuts(points, edges)
+    decomposition = _Decomposition(points, edges)
     for corner in sorted(reflex):
-        while sector := cuts.reflex_sector(corner):
-            end = cuts.best_end(corner, sector, reflex)
+        while sector := decomposition.reflex_sector(corner):
+            end = decomposition.best_end(corner, sector, reflex)
             if end is None:
                 return None
-            cuts.add(corner, end)
-    cuts.leave_out_needless()
-    polygons = cuts.polygons()
+            decomposition.add(corner, end)
+    decomposition.remove_redundant()
+    polygons = decomposition.polygons()
     return polygons if polygons is not None and len(polygons) <= maximum else None
 
 
-class _Cuts:
-    """An outline, and the lines that cut it.
+class _Decomposition:
+    """An outline, and diagonals that cut it.
 
-    It lists the ends of the lines from each corner, counterclockwise: first the edge after it, last the edge before it.
+    Each corner has the other ends of its edges and diagonals, counterclockwise: first of the edge after it, last of the
+    edge before it.
     """
 
     def __init__(self, points: np.ndarray, edges: np.ndarray):
@@ -115,17 +117,17 @@ class _Cuts:
         self._ends = {corner: [next_vertex, previous_vertex[corner]] for corner, next_vertex in edges.tolist()}
 
     def reflex_sector(self, corner: int) -> tuple[int, int] | None:
-        """Ends of two lines from a corner between which it is reflex."""
+        """The ends of two consecutive lines from a corner that enclose a reflex angle; None where there are none."""
         edge_ends = self._ends[corner]
         sectors = zip(edge_ends[:-1], edge_ends[1:], strict=True)
         return next((sector for sector in sectors if _is_reflex(self._points, sector[1], corner, sector[0])), None)
 
     def best_end(self, corner: int, sector: tuple[int, int], reflex: set[int]) -> int | None:
-        """The corner to which a line in a reflex sector goes; None where none is seen."""
+        """The corner at which to end a diagonal that splits a reflex sector; None where none is visible."""
         first, last = sector
         first_offset, last_offset = self._points[[first, last]] - self._points[corner]
 
-        def is_seen(end: int) -> bool:
+        def is_visible(end: int) -> bool:
             end_offset = self._points[end] - self._points[corner]
             is_outside = _cross(last_offset, end_offset) >= 0 and _cross(end_offset, first_offset) >= 0
             return not is_outside and not self._crosses(corner, end)
@@ -134,10 +136,10 @@ class _Cuts:
             leaves_some = _is_reflex(self._points, end, corner, first) or _is_reflex(self._points, last, corner, end)
             return leaves_some, end not in reflex, float(np.hypot(*(self._points[end] - self._points[corner])))
 
-        return min((end for end in self._ends if end != corner and is_seen(end)), key=cost, default=None)
+        return min((end for end in self._ends if end != corner and is_visible(end)), key=cost, default=None)
 
     def _crosses(self, corner: int, end: int) -> bool:
-        """Whether a line from one corner to another crosses others, or passes a corner."""
+        """Whether the diagonal between two corners crosses an edge or diagonal, or touches a corner."""
         a, b = self._points[[corner, end]]
         line, offsets = b - a, self._points[[other for other in self._ends if other not in (corner, end)]] - a
         heights, line_shares = _cross(line, offsets) / (line @ line), offsets @ line / (line @ line)
@@ -148,7 +150,7 @@ class _Cuts:
         return bool((parts_ends & (_cross(d - c, a - c) * _cross(d - c, b - c) < 0)).any())
 
     def add(self, corner: int, end: int) -> None:
-        """Cut from one corner to another."""
+        """Add the diagonal between two corners."""
         self._lines = np.concatenate([self._lines, [[corner, end]]])
         for one, other in ((corner, end), (end, corner)):
             edge_ends = self._ends[one]
@@ -156,8 +158,8 @@ class _Cuts:
             *angles, angle = np.arctan2(_cross(offsets[0], offsets), offsets @ offsets[0]) % (2 * np.pi)
             edge_ends.insert(1 + sum(other_angle < angle for other_angle in angles[1:-1]), other)
 
-    def leave_out_needless(self) -> None:
-        """Take lines away, in the order in which they came, that leave no corner reflex where they are not."""
+    def remove_redundant(self) -> None:
+        """Remove diagonals without which both of their ends stay convex, in the order in which they were added."""
         for line in self._lines[len(self._ends) :].tolist():
             sectors = []
             for corner, end in (line, line[::-1]):
@@ -169,7 +171,7 @@ class _Cuts:
                     self._ends[corner].remove(end)
 
     def polygons(self) -> list[np.ndarray] | None:
-        """Walk around each polygon; None where one is not convex."""
+        """Traverse the boundary of each polygon; None where one is not convex."""
         steps = {(corner, end) for corner, edge_ends in self._ends.items() for end in edge_ends[:-1]}
         closed_polygons = []
         while steps:
@@ -188,12 +190,12 @@ class _Cuts:
 
 
 def _is_reflex(points: np.ndarray, previous_vertex: int, corner: int, next_vertex: int) -> bool:
-    """Whether a way turns right at a corner."""
+    """Whether a boundary turns right at a corner."""
     return bool(_turns(points[[previous_vertex, corner, next_vertex]])[1] < -_STRAIGHT)
 
 
 def _turns(polygon: np.ndarray) -> np.ndarray:
-    """Sine of the angle by which the way around a polygon turns left at each corner, [corner]."""
+    """Sine of the angle by which the boundary of a polygon turns left at each corner, [corner]."""
     inward, next_end = polygon - np.roll(polygon, 1, axis=0), np.roll(polygon, -1, axis=0) - polygon
     return _cross(inward, next_end) / (np.linalg.norm(inward, axis=1) * np.linalg.norm(next_end, axis=1))
 

@@ -1,4 +1,6 @@
-"""Panels: nearly flat, convex regions of a sheet, which is a mesh of one layer, such as cloth, or of a thin wall's."""
+"""Panels: nearly flat, convex regions of a sheet. A sheet is an open surface, such as cloth, or a layer of a thin
+wall.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,46 +11,46 @@ from warpshadow.maths.components import connected_components
 from warpshadow.maths.decimation import decimate
 from warpshadow.maths.outline import cut_outline, find_outline
 from warpshadow.maths.plane import is_flat, principal_axes
-from warpshadow.maths.polygons import join_triangles
+from warpshadow.maths.polygons import merge_triangles
 
 MAX_PANELS_OF = {0.007: 160, 0.01: 352, 0.02: 288, 0.04: 144}
-"""How many panels a mesh may have, by their tolerance: thickness and mean gap to the mesh at most, over the scale of
-their sheet. They are tried in order, until the mesh has no more. A shell's shadow is a polygon: on the ground under a
-bowl of a thin wall, 128² pixels, light is off by 2.2% with 0.02 (131 panels), 1.4% with 0.01 (265), 0.9% with 0.007
-(361), 3.9% by 1024 spheres, and an iteration of its pose takes 0.27, 0.36, 0.43, 0.19 s of CPU time. A mug's has
-corners at its foot with more than 0.007. A bunny would have 190 with 0.04, and has spheres."""
+"""Maximum number of panels of a mesh by their tolerance: their largest thickness and mean gap to the mesh, over the
+scale of their sheet. Tolerances are tried in order until the number suffices. A shell's shadow is a polygon: on the
+ground under a bowl of a thin wall, 128² pixels, light is off by 2.2% with 0.02 (131 panels), 1.4% with 0.01 (265), 0.9%
+with 0.007 (361), 3.9% by 1024 spheres, and an iteration of its pose takes 0.27, 0.36, 0.43, 0.19 s of CPU time. A mug's
+shadow has corners at its foot with more than 0.007. A bunny would have 190 with 0.04, and has spheres."""
 
-MAX_FLAT_PANELS_OF = {1e-3: 64}  # deviation and number for flat panels, which shade nothing that lies on the mesh
+MAX_FLAT_PANELS_OF = {1e-3: 64}  # the same for flat panels, which do not shade the mesh itself
 
 _MAX_SCALE = 2.0
-"""Scale of a sheet over its extent at most. The scale is the geometric mean of the extents of the sheet and the mesh:
+"""Maximum scale of a sheet over its extent. The scale is the geometric mean of the extents of the sheet and the mesh:
 small sheets have fewer panels. Half a shell beside one of 7 times its size has 29, and a ball in it is 0.2% too dark;
 with 3 it has 24, and the ball is 4.7% too dark; by spheres it is 16% too bright."""
 
 _DECIMATION = 0.6  # tolerance of decimation over that of panels, which are joined from its triangles
-_MAX_TRIANGLES = 3  # of a panel that are joined, in the mean, at most
-_CREASE = 0.94  # cosine of the angle between neighboring triangles, 20°, beyond which there is a crease between them
+_MAX_TRIANGLES = 3  # maximum mean number of triangles of a panel
+_CREASE = 0.94  # cosine of the smallest dihedral angle of a crease, 20°
 
 
 def find_panels(
     points: np.ndarray, triangles: np.ndarray, tolerance: float, maximum: int, *, decimates: bool = True
 ) -> list[np.ndarray] | None:
-    """Cut a sheet into panels.
+    """Decompose a sheet into panels.
 
-    First along creases. Regions that lie in a plane and whose outline is not convex, such as a wall with a window, are
-    cut into convex ones exactly. If all others are thin and convex, they are panels, and neighbors are joined that make
-    one together. Else the triangles of the others are joined, or those of their decimated mesh if these make fewer
-    panels [Garland and Heckbert 1997; Lien and Amato 2007: approximate convex decomposition].
+    The sheet is cut along creases. Coplanar regions that are not convex, such as a wall with a window, are decomposed
+    exactly. If all other regions are thin and convex, they are panels, and adjacent ones are merged where the result is
+    a panel. Otherwise their triangles are merged, or those of the decimated regions if that gives fewer panels
+    [Garland and Heckbert 1997; Lien and Amato 2007: approximate convex decomposition].
 
     Args:
         points: Vertices, float64 of shape [vertex, 3].
-        triangles: Triangles, shape [triangle, 3]; slivers without area do not count.
-        tolerance: Thickness and mean gap of a panel at most [units of points].
-        maximum: Number of panels at most.
-        decimates: Whether meshes that bend are decimated; else they have no panels.
+        triangles: Triangles, shape [triangle, 3]; slivers do not count.
+        tolerance: Maximum thickness and mean gap of a panel [units of points].
+        maximum: Maximum number of panels.
+        decimates: Whether bent regions are decimated; otherwise a sheet with any has no panels.
 
     Returns:
-        Vertices at the corners of each, in order around it, int of shape [corner]; None where there are more.
+        Corners of each panel in order, indices of points, int of shape [corner]; None if more panels are needed.
     """
     triangles, numbers = _smooth_regions(points, triangles)
     exact: list[np.ndarray] = []
@@ -62,13 +64,13 @@ def find_panels(
                 del regions[number], deviations[number]
         if max(deviations, default=0.0) <= tolerance:
             return exact + [
-                _outline(points, panel, tolerance / 2) for panel in _join_regions(points, regions, tolerance)
+                _outline(points, panel, tolerance / 2) for panel in _merge_regions(points, regions, tolerance)
             ]
         triangles = np.concatenate(regions)
     if not decimates:
         return None
     meshes = [decimate(points, triangles, _DECIMATION * tolerance), triangles]
-    joined = [join_triangles(points, mesh, tolerance) for mesh in meshes if len(mesh) <= _MAX_TRIANGLES * maximum]
+    joined = [merge_triangles(points, mesh, tolerance) for mesh in meshes if len(mesh) <= _MAX_TRIANGLES * maximum]
     panels = min(joined, key=len, default=None)
     return exact + panels if panels is not None and len(panels) <= maximum else None
 
@@ -76,15 +78,15 @@ def find_panels(
 def find_panels_of_sheets(
     points: np.ndarray, sheets: Sequence[np.ndarray], max_panels_of: Mapping[float, int] = MAX_PANELS_OF
 ) -> list[list[np.ndarray]] | None:
-    """Cut sheets of a mesh into panels, as flat as there may be.
+    """Decompose the sheets of a mesh into panels of the smallest tolerance that the numbers allow.
 
     Args:
         points: Vertices, float64 of shape [vertex, 3].
         sheets: Triangles of each, [sheet][triangle, 3].
-        max_panels_of: One of the tables above. Sheets bend where it is not :data:`MAX_FLAT_PANELS_OF`.
+        max_panels_of: :data:`MAX_PANELS_OF` or, if sheets may not bend, :data:`MAX_FLAT_PANELS_OF`.
 
     Returns:
-        Corners of the panels of each sheet, as of :func:`find_panels`; None where there are more.
+        Corners of the panels of each sheet, as of :func:`find_panels`; None if more panels are needed.
     """
     size = np.ptp(points, axis=0).max()
     extents = np.array([np.ptp(points[sheet.ravel()], axis=0).max() for sheet in sheets])
@@ -104,7 +106,7 @@ def find_panels_of_sheets(
 
 
 def _smooth_regions(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles that have an area, and numbers of their regions between creases, as edges of more than two are."""
+    """Triangles without slivers, and the region of each: regions end at creases and non-manifold edges."""
     corners = points[triangles]
     normals = area_normals(corners)
     lengths = np.linalg.norm(normals, axis=1)
@@ -118,7 +120,7 @@ def _smooth_regions(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarr
 
 
 def _flat_polygons(points: np.ndarray, region: np.ndarray, maximum: int) -> list[np.ndarray] | None:
-    """Corners of the convex polygons into which a region of a plane is cut; None if it lies in none, or of more."""
+    """Corners of the convex polygons of a coplanar region; None if it is not coplanar, or if more are needed."""
     used_vertices, faces = np.unique(region, return_inverse=True)
     if not is_flat(points[used_vertices]):
         return None
@@ -128,7 +130,7 @@ def _flat_polygons(points: np.ndarray, region: np.ndarray, maximum: int) -> list
 
 
 def _deviation(points: np.ndarray, region: np.ndarray) -> float:
-    """Deviation of a region from a panel: its thickness, or the mean width by which a convex outline is larger."""
+    """Deviation of a region from a panel: its thickness, or the mean width of its gap to its convex hull."""
     from scipy.spatial import ConvexHull
 
     local_points = points[region] @ principal_axes(points[np.unique(region)]).T
@@ -139,8 +141,8 @@ def _deviation(points: np.ndarray, region: np.ndarray) -> float:
     return float(max(np.ptp(local_points[..., 2]), (outline.volume - area) / np.ptp(flat[..., 0])))
 
 
-def _join_regions(points: np.ndarray, regions: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
-    """Join regions that share an edge and make one panel."""
+def _merge_regions(points: np.ndarray, regions: list[np.ndarray], tolerance: float) -> list[np.ndarray]:
+    """Merge regions that share an edge where the result is a panel."""
     panels: list[np.ndarray] = []
     for region in regions:
         for number, panel in enumerate(panels):
@@ -154,18 +156,18 @@ def _join_regions(points: np.ndarray, regions: list[np.ndarray], tolerance: floa
 
 
 def _outline(points: np.ndarray, region: np.ndarray, tolerance: float) -> np.ndarray:
-    """Corners around a region, but for corners that stand out by less than the tolerance."""
+    """Corners of the convex hull of a region, simplified up to a tolerance [Douglas and Peucker 1973]."""
     from scipy.spatial import ConvexHull
 
     used_vertices = np.unique(region)
     flat = points[used_vertices] @ principal_axes(points[used_vertices])[:2].T
-    rim = ConvexHull(flat).vertices
-    rim_ends = np.array([flat[rim, 0].argmin(), flat[rim, 0].argmax()])  # of the rim, in order
+    hull = ConvexHull(flat).vertices
+    chosen_corners = np.array([flat[hull, 0].argmin(), flat[hull, 0].argmax()])
     while True:
-        corners = flat[rim[np.sort(rim_ends)]]
+        corners = flat[hull[np.sort(chosen_corners)]]
         sides = np.roll(corners, -1, axis=0) - corners
         outward = np.stack([sides[:, 1], -sides[:, 0]], axis=1) / np.linalg.norm(sides, axis=1, keepdims=True)
-        heights = ((flat[rim][:, None] - corners) * outward).sum(axis=-1).max(axis=1)
-        if len(rim_ends) > 2 and heights.max() <= tolerance:
-            return used_vertices[rim[np.sort(rim_ends)]]
-        rim_ends = np.append(rim_ends, heights.argmax())
+        heights = ((flat[hull][:, None] - corners) * outward).sum(axis=-1).max(axis=1)
+        if len(chosen_corners) > 2 and heights.max() <= tolerance:
+            return used_vertices[hull[np.sort(chosen_corners)]]
+        chosen_corners = np.append(chosen_corners, heights.argmax())

@@ -1,4 +1,4 @@
-"""Planes: whether triangles or points lie in one."""
+"""Planes: whether triangles or points are coplanar."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ _FLATNESS = 1e-4  # relative thickness below which a mesh counts as flat
 
 
 def plane_normal(corners: np.ndarray) -> np.ndarray | None:
-    """Find the normal of triangles that lie in one plane.
+    """Find the normal of coplanar triangles.
 
     Args:
         corners: Float64 of shape [face, 3, 3].
     Returns:
-        Unit normal, their mean by area, shape [3]; None where they do not lie in one plane, or have no mean.
+        Unit normal, weighted by area, shape [3]; None if triangles are not coplanar, or if their normals cancel.
     """
     normal = area_normals(corners).sum(axis=0)
     if not normal.any():
@@ -24,12 +24,12 @@ def plane_normal(corners: np.ndarray) -> np.ndarray | None:
 
 
 def is_flat(points: np.ndarray) -> bool:
-    """Whether points of float64, shape [point, 3], lie in one plane."""
+    """Whether points, float64 of shape [point, 3], are coplanar."""
     axes = principal_axes(points)
     return bool(np.ptp(points @ axes[2]) < _FLATNESS * np.ptp(points @ axes[0]))
 
 
 def principal_axes(points: np.ndarray) -> np.ndarray:
-    """Unit vectors along which points extend most, second most and least, shape [3, 3]."""
+    """Unit vectors of the principal axes of points, the longest first, shape [3, 3]."""
     away = points - points.mean(axis=0)
     return np.linalg.eigh(away.T @ away)[1].T[::-1]

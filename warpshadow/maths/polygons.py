@@ -1,41 +1,41 @@
-"""Convex polygons into which triangles of a surface are joined."""
+"""Convex polygons of a surface, merged from its triangles."""
 
 import heapq
 
 import numpy as np
 
-_STRAIGHT = 1e-6  # angle [rad] up to which a corner may turn the other way
+_STRAIGHT = 1e-6  # largest reflex angle of a corner [rad]
 _BEND = 0.1
-"""How far corners are from a plane at most, over the tolerance. A bent polygon leaps from one side to the other as a
+"""Largest distance of corners from a plane, over the tolerance. A bent polygon flips from one side to the other as a
 receiver passes its plane: with 1 gradients of the shadow of a dome are twice as large as differences, with 0.25 off by
 2%, with 0.05 by 0.2%."""
 
-_GAP = 0.01  # distance of a corner from the line between those beside it up to which it is none, over the tolerance
+_GAP = 0.01  # corners are straight up to this distance from the line through their neighbors, over the tolerance
 
 
-def join_triangles(points: np.ndarray, triangles: np.ndarray, tolerance: float) -> list[np.ndarray]:
-    """Join neighboring triangles to convex polygons, the thinnest first, while they are thin.
+def merge_triangles(points: np.ndarray, triangles: np.ndarray, tolerance: float) -> list[np.ndarray]:
+    """Merge adjacent triangles into thin convex polygons, the thinnest first.
 
-    Polygons beside each other share whole sides, so there is no gap between them, wherever they are seen from.
+    Adjacent polygons share whole sides, so no gap is seen between them from anywhere.
 
     Args:
         points: Float64 of shape [point, 3].
-        triangles: That wind alike, shape [triangle, 3].
-        tolerance: Thickness of a polygon at most, of all corners of its triangles [units of points].
+        triangles: Consistently wound, shape [triangle, 3].
+        tolerance: Maximum thickness of a polygon, measured at all corners of its triangles [units of points].
 
     Returns:
-        Points at the corners of each, in order around it, int of shape [corner].
+        Corners of each polygon in order, indices of points, int of shape [corner].
     """
-    joiner = _Joiner(points, triangles, tolerance)
-    joiner.join()
-    return [np.array(_without_straight(points, outline, _GAP * tolerance)) for outline in joiner.outlines.values()]
+    merger = _Merger(points, triangles, tolerance)
+    merger.merge()
+    return [np.array(_without_collinear(points, outline, _GAP * tolerance)) for outline in merger.outlines.values()]
 
 
-class _Joiner:
-    """Polygons, by their numbers.
+class _Merger:
+    """Polygons by number, and pairs of them that may merge.
 
     Args:
-        points, triangles, tolerance: As of :func:`join_triangles`.
+        points, triangles, tolerance: As of :func:`merge_triangles`.
     """
 
     def __init__(self, points: np.ndarray, triangles: np.ndarray, tolerance: float):
@@ -43,10 +43,10 @@ class _Joiner:
         self._points, self._tolerance = points, tolerance
         self._corners = {number: frozenset(outline) for number, outline in self.outlines.items()}
         self._polygon_at = {side: number for number, outline in self.outlines.items() for side in _sides(outline)}
-        self._pairs: list[tuple[float, int, int, list[int]]] = []  # of polygons that may be joined, with the outline
+        self._pairs: list[tuple[float, int, int, list[int]]] = []  # thickness, polygons, merged outline
 
-    def join(self) -> None:
-        """Join polygons until no two can be."""
+    def merge(self) -> None:
+        """Merge polygons while a pair is left."""
         for number in self.outlines:
             self._find_pairs(number)
         new = len(self.outlines)
@@ -64,7 +64,7 @@ class _Joiner:
             new += 1
 
     def _find_pairs(self, number: int, later_only: bool = True) -> None:
-        """List the neighbors with which a polygon may be joined."""
+        """Queue the neighbors with which a polygon may merge."""
         neighbors = {self._polygon_at.get(side[::-1], -1) for side in _sides(self.outlines[number])} - {-1, number}
         for neighbor in sorted(neighbors):
             if later_only and neighbor < number:
@@ -84,16 +84,16 @@ class _Joiner:
                 heapq.heappush(self._pairs, (thickness, number, neighbor, outline))
 
     def _outline_of_both(self, number: int, neighbor: int) -> list[int] | None:
-        """The outline around two polygons; None if they touch in more than one line."""
+        """The outline of two polygons together; None if it is not one loop."""
         sides = {side for polygon in (number, neighbor) for side in _sides(self.outlines[polygon])}
-        rim = [side for side in sorted(sides) if side[::-1] not in sides]
-        next_corner = dict(rim)
-        if len(next_corner) < max(len(rim), 3):
+        boundary = [side for side in sorted(sides) if side[::-1] not in sides]
+        next_corner = dict(boundary)
+        if len(next_corner) < max(len(boundary), 3):
             return None
-        outline = [rim[0][0]]
+        outline = [boundary[0][0]]
         while (corner := next_corner[outline[-1]]) != outline[0]:
             outline.append(corner)
-        return outline if len(outline) == len(rim) else None
+        return outline if len(outline) == len(boundary) else None
 
 
 def _sides(outline: list[int]) -> list[tuple[int, int]]:
@@ -102,22 +102,22 @@ def _sides(outline: list[int]) -> list[tuple[int, int]]:
 
 
 def _normal(corners: np.ndarray) -> np.ndarray:
-    """Unit normal of a polygon in space, the mean over its area."""
+    """Unit normal of a polygon in space, weighted by area (Newell)."""
     offsets = corners - corners[0]
     normal = np.cross(offsets[1:-1], offsets[2:]).sum(axis=0)
     return normal / max(np.linalg.norm(normal), 1e-30)
 
 
 def _is_convex(corners: np.ndarray, normal: np.ndarray) -> bool:
-    """Whether a polygon, seen along its normal, turns left at each corner, once around."""
+    """Whether a polygon, seen against its normal, turns left at each corner, 360° in all."""
     sides = np.roll(corners, -1, axis=0) - corners
     before = np.roll(sides, 1, axis=0)
     turns = np.arctan2(np.cross(before, sides) @ normal, (before * sides).sum(axis=1))
     return bool(turns.min() > -_STRAIGHT and turns.sum() < 3 * np.pi)
 
 
-def _without_straight(points: np.ndarray, outline: list[int], gap: float) -> list[int]:
-    """Corners around a polygon, but for those on straight sides."""
+def _without_collinear(points: np.ndarray, outline: list[int], gap: float) -> list[int]:
+    """The corners of a polygon without straight ones."""
     for corner in list(outline):
         at = outline.index(corner)
         before, after = outline[at - 1], outline[(at + 1) % len(outline)]

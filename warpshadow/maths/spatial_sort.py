@@ -1,4 +1,4 @@
-"""Compact order: points near in space are near in memory, so that kernels can process several at once."""
+"""Spatial sorting: points near in space are near in memory, so that kernels can process several at once."""
 
 import numpy as np
 
@@ -8,10 +8,9 @@ def compact_order(points: np.ndarray, *, runs: tuple[int, ...] = (16, 4)) -> np.
 
     Args:
         points: Shape [point, 3].
-        runs: Lengths of the runs that are to be compact, each a multiple of the next.
+        runs: Lengths of compact runs, each a multiple of the next.
     Returns:
-        Indices [point]: as they follow each other, the points of every run are near each other; the last run of a
-        length may be short.
+        Permutation [point] in which the points of every run are near each other; the last run may be short.
     """
     count = len(points)
     unit = next((run for run in runs if run < count), None)
@@ -25,12 +24,12 @@ def compact_order(points: np.ndarray, *, runs: tuple[int, ...] = (16, 4)) -> np.
 
 
 def z_order(points: np.ndarray) -> np.ndarray:
-    """Order points along a space-filling curve: much faster than :func:`compact_order`, but less compact.
+    """Order points along a Z-order curve: much faster than :func:`compact_order`, but less compact.
 
     Args:
         points: Shape [point, 3].
     Returns:
-        Indices [point].
+        Permutation [point].
     """
     if not len(points):
         return np.arange(0)
@@ -46,7 +45,7 @@ def z_order_of_cells(cells: np.ndarray) -> np.ndarray:
 
 
 def _spread(integers: np.ndarray) -> np.ndarray:
-    """Put two zeros between all bits of numbers of 21 bits."""
+    """Insert two zeros between the bits of numbers of 21 bits."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),

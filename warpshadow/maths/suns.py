@@ -1,10 +1,10 @@
 """Suns of an equirectangular map: its small bright discs.
 
-Gloss and remarks go by them. Elsewhere bright light is found that need be no disc of a map:
+Gloss and remarks use them. Other parts of the package search for bright light by criteria of their own:
 
-| where | bright are | reason |
+| where | bright light | reason |
 | --- | --- | --- |
-| :func:`.light_samples.cut_map` | pixels of 30 means | a window, too, takes too many directions |
+| :func:`.light_samples.cut_map` | pixels above 30 times the mean | windows, too, take too many directions |
 | :func:`.sun_cells.find_sun_cells` | cells with 5% of all light | any such cell is worth its rays |
 | :func:`.sharp_cells.find_sharp_cells` | cells whose light is smaller than they are | its shadows have sharper edges |
 """
@@ -17,32 +17,32 @@ from warpshadow.maths import sh
 
 _MAX_SUNS = 8
 _BRIGHTNESS = 10.0  # radiance above which a pixel may be of a sun, in means of the map
-_MIN_SHARE = 0.003  # of all light, that a sun has at least
-_RADII = np.radians([6.0, 3.0, 1.5])  # of discs that are tried around the brightest spot, the widest first
-_MAX_SPREAD = 2.0  # size by the mean square of angles over the area that shines: 1 of discs, more of tubes and pairs
-_ISOLATION = 0.9  # of the bright light within twice that radius, that is within it: of wider spots it is less
-_RIM = 1.25  # where a disc has ended, in radii: as far as that nothing beside it is half as bright
-_MAX_AREA = 1.2  # size of a sun, in discs of that radius: a pixel of a coarse map is larger
-_MAX_TRIALS = 32  # brightest spots that are tried
+_MIN_SHARE = 0.003  # minimum share of all light
+_RADII = np.radians([6.0, 3.0, 1.5])  # of discs to try around the brightest spot, the widest first
+_MAX_SPREAD = 2.0  # largest solid angle by the variance over the bright one: 1 for discs, more for tubes and pairs
+_ISOLATION = 0.9  # minimum share of the disc in the bright light within twice its radius: wider spots have less
+_RIM = 1.25  # outer radius, in radii of the disc, of the ring in which no pixel may be half as bright as the brightest
+_MAX_AREA = 1.2  # largest solid angle over that of the disc: a pixel of a coarse map has more
+_MAX_TRIALS = 32  # number of bright spots to try
 
 
 class Suns(NamedTuple):
     """Suns of a map, float64."""
 
-    directions: np.ndarray  # unit vectors towards their middles, [sun, 3]
-    irradiance: np.ndarray  # E of a surface that faces them, linear RGB, [sun, 3]
+    directions: np.ndarray  # unit vectors to their centers, [sun, 3]
+    irradiance: np.ndarray  # on a surface that faces them, linear RGB, [sun, 3]
     solid_angles: np.ndarray  # Ω [sr], [sun]
 
 
 class SeparatedLight(NamedTuple):
-    """A map that is separated from its suns."""
+    """Suns, and the rest of a map."""
 
     suns: Suns
-    without_suns: np.ndarray  # the map, in which their pixels are cut to ten times its mean radiance
+    without_suns: np.ndarray  # the map, their pixels clamped to ten times its mean radiance
 
 
 def separate_suns(radiance: np.ndarray) -> SeparatedLight:
-    """Separate suns from a map, at most 8: discs of up to 6° in radius that are much brighter than all on average.
+    """Separate up to 8 suns from a map: discs of up to 6° in radius that are much brighter than its mean.
 
     Args:
         radiance: Linear RGB, shape [height, 2·height, 3].
@@ -74,7 +74,7 @@ def separate_suns(radiance: np.ndarray) -> SeparatedLight:
             if has_ended and disc.sum() > max(_MIN_SHARE * total, _ISOLATION * wider_power):
                 mean = disc @ directions[is_near] / disc.sum()
                 length = np.linalg.norm(mean)
-                # of a disc the mean square of angles to its middle is Ω / (2π); pixels have a size, too
+                # the variance of angles over a disc is Ω / (2π), plus that of its pixels
                 size = 4 * np.pi * (1 - length) + disc @ solid_angles[pixels[is_near]] / disc.sum()
                 area = disc.sum() ** 2 / (disc**2 / solid_angles[pixels[is_near]]).sum()
                 if size < min(_MAX_SPREAD * area, _MAX_AREA * 2 * np.pi * (1 - np.cos(radius))):
@@ -91,7 +91,7 @@ def separate_suns(radiance: np.ndarray) -> SeparatedLight:
 
 
 def directions_in_suns(suns: Suns, count: int) -> np.ndarray:
-    """Directions that are even over each sun; unit vectors, [sun, direction, 3]."""
+    """Evenly distributed directions over each sun; unit vectors, [sun, direction, 3]."""
     i = np.arange(count)
     x, y = np.sqrt((i + 0.5) / count) * [np.cos(np.pi * (1 + np.sqrt(5)) * i), np.sin(np.pi * (1 + np.sqrt(5)) * i)]
     axes = np.eye(3)[np.abs(suns.directions).argmin(axis=1)]

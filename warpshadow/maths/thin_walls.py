@@ -1,8 +1,8 @@
-"""Thin walls: closed surfaces around one, such as mugs and plates, and one layer of them, which blocks for both.
+"""Thin walls: closed surfaces of two layers, such as mugs and plates, and the outer layer, which blocks for both.
 
-A wall's two layers are where most of a surface has its other side opposite: faces and their opposites are a signed
-graph, in which neighbors should be on one side and opposites on two. The vector of the least eigenvalue of its
-Laplacian tells the sides [Kunegis et al. 2010: spectral analysis of signed graphs].
+Faces are the nodes of a signed graph: adjacent faces should be in one layer, opposite faces in different ones. The
+eigenvector of the smallest eigenvalue of its Laplacian separates the layers [Kunegis et al. 2010: spectral analysis of
+signed graphs].
 """
 
 import numpy as np
@@ -11,25 +11,25 @@ from warpshadow.maths.adjacency import area_normals, edge_neighbors
 from warpshadow.maths.plane import principal_axes
 
 MAX_THICKNESS = 0.06
-"""Thickness of a wall at most, over the size of the mesh: a mug's has 0.04, a cup's 0.055, a knot's rod 0.09."""
+"""Maximum thickness of a wall over the size of the mesh: a mug has 0.04, a cup 0.055, the rod of a knot 0.09."""
 
 MIN_DEPTH = 1.5
-"""Least extent of a layer along any axis, over the mean thickness: of plates and lids 5 to 8, a tray with a low rim
-1.7; of slabs, whose thickness is seen, 0.8."""
+"""Minimum extent of a layer along its shortest axis, over the mean thickness: plates and lids have 5 to 8, a tray with
+a low rim 1.7; slabs, whose thickness is visible, 0.8."""
 
 MIN_OPPOSED = 0.8
-"""Share of the surface at least that is on another side than its opposite: of cups and bottles 0.97, a plate with a
-foot 0.89, a bracket 0.46."""
+"""Minimum share of the surface whose opposite is in the other layer: cups and bottles have 0.97, a plate with a foot
+0.89, a bracket 0.46."""
 
 MAX_RIM = 0.15
-"""Area of the rim between the layers at most, over that of the surface: of a mug 0.02, a bowl 0.09, a rod 0.6."""
+"""Maximum area of the rim between the layers, over that of the surface: a mug has 0.02, a bowl 0.09, a rod 0.6."""
 
 _MAX_FACES = 50_000
-_SAMPLES = 8192  # points of the surface that look for the other side
-_CANDIDATES = 8  # samples near where the other side should be
-_OPPOSITE = -0.5  # cosine of the angle between normals at most
-_REACH = 0.02  # distance over the size of the mesh, beside twice the thickness, up to which samples may be opposite
-_MIN_LINK = 0.01  # of faces beside each other, however sharp the edge between them, next to 1 for flat ones
+_SAMPLES = 8192  # points of the surface for which opposite ones are searched
+_CANDIDATES = 8  # nearest samples to the expected opposite point
+_OPPOSITE = -0.5  # largest cosine between the normals of opposite samples
+_REACH = 0.02  # largest distance from the expected opposite point: this times the size of the mesh, plus 2 thicknesses
+_MIN_LINK = 0.01  # weight of adjacent faces at a sharp edge; 1 where they are coplanar
 
 
 def find_layer(points: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
@@ -37,10 +37,10 @@ def find_layer(points: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
 
     Args:
         points: Vertices, float64 of shape [vertex, 3].
-        triangles: Of a closed surface that winds alike, shape [triangle, 3].
+        triangles: Of a closed, consistently wound surface, shape [triangle, 3].
 
     Returns:
-        Those of the layer with the larger area; None where the surface is not that of a thin, hollow wall.
+        Triangles of the layer with the larger area; None if the surface is not a thin, hollow wall.
     """
     from scipy.sparse import coo_matrix, diags
     from scipy.sparse.linalg import eigsh
@@ -66,7 +66,7 @@ def find_layer(points: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
     ends = np.concatenate([np.stack([face, neighbor], axis=1), opposites])
     adjacency = coo_matrix((weights, tuple(ends.T)), (count, count)).tocsr()
     adjacency = adjacency + adjacency.T
-    degrees = np.asarray(abs(adjacency).sum(axis=1)).ravel() + 1e-9 * area  # of a vector that fits wholly, too
+    degrees = np.asarray(abs(adjacency).sum(axis=1)).ravel() + 1e-9 * area  # keeps it positive definite
     masses = diags(areas + 1e-6 * area / count).tocsc()
     laplacian = (diags(degrees) - adjacency).tocsc()
     _, vectors = eigsh(laplacian, k=1, M=masses, sigma=0, v0=np.ones(count))
@@ -83,7 +83,7 @@ def find_layer(points: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
 
 
 def _opposites(corners: np.ndarray, units: np.ndarray, areas: np.ndarray, thickness: float, reach: float) -> np.ndarray:
-    """Pairs of faces opposite to each other, of the samples that have an opposite, shape [pair, 2]."""
+    """Pairs of opposite faces, one for each sample that has an opposite, shape [pair, 2]."""
     from scipy.spatial import cKDTree
 
     numbers = (np.arange(_SAMPLES) + 0.5) / _SAMPLES

@@ -1,4 +1,4 @@
-"""Tubes: rods that are bent, or closed to a ring, of quads around them; cut across, into straight segments."""
+"""Tubes: bent or ring-shaped rods of quads, cut across into straight segments."""
 
 import functools
 import itertools
@@ -9,32 +9,32 @@ import numpy as np
 
 from warpshadow.maths.adjacency import area_normals, edges_of
 
-SLACK = 0.2  # distance of a corner of a tube from its straight segments at most, over the radius of its section
+SLACK = 0.2  # largest distance of a tube's surface from its straight segments, over the radius of its section
 
-MAX_SEGMENTS = 128  # segments of the tubes of a mesh at most: beyond, spheres are faster
+MAX_SEGMENTS = 128  # of all tubes of a mesh: beyond, spheres are faster
 
 _MAX_BEND = 0.95
-"""Cosine of the angle between neighboring segments at least, 18°: with 30° shadows of rings had corners."""
+"""Cosine of the largest angle between adjacent segments, 18°: with 30° shadows of rings had corners."""
 
 _MAX_SWELL = 0.03
-"""Distance of the corners of a section from its middle, over that of straight segments, from 1 at most: rods are bent,
-not turned on a lathe. Grooves of a column would have no shadows on it."""
+"""Largest relative deviation of the radius of a section from that of a straight segment. Surfaces of revolution deviate
+more: a column would have no shadows in its grooves."""
 
-_MAX_TWIST = 0.02  # 1 − cos α of the angle between the triangles of a quad at most, 11°; and error of the volume
+_MAX_TWIST = 0.02  # largest 1 − cos α between the triangles of a quad, 11°; and largest relative error of volume
 
 
 class Tube(NamedTuple):
     """A tube, cut into straight segments."""
 
     sections: np.ndarray
-    """Vertices around it between segments and at its ends, those beside each other in one column, int of shape
-    [segment + 1, corner]: of a closed tube the last are the first."""
-    segments: list[np.ndarray]  # triangles of the convex hull of two sections, which wind alike, [triangle, 3]
+    """Indices of vertices around each section, corresponding ones in one column, int of shape [segment + 1, corner].
+    The last section of a closed tube is the first."""
+    segments: list[np.ndarray]  # triangles of the convex hull of two sections, consistently wound, [triangle, 3]
     gaps: np.ndarray  # largest distance of the surface from each segment [units of points], shape [segment]
 
 
 class _Ring(NamedTuple):
-    """A ring of quads around a tube: their numbers, and the vertices of its borders, in order around it."""
+    """A ring of quads around a tube: their indices, and the vertices of both boundaries in order."""
 
     quads: list[int]
     front: np.ndarray
@@ -42,37 +42,37 @@ class _Ring(NamedTuple):
 
 
 def find_tube(points: np.ndarray, triangles: np.ndarray, maximum: int) -> Tube | None:
-    """Cut a tube across.
+    """Cut a tube into straight segments.
 
     Args:
         points: Vertices, float64 of shape [vertex, 3].
-        triangles: Triangles of a closed surface that wind alike, shape [triangle, 3].
-        maximum: Number of segments at most.
+        triangles: Triangles of a closed surface, consistently wound, shape [triangle, 3].
+        maximum: Maximum number of segments.
 
     Returns:
-        The tube; None where quads that are nearly flat, and flat ends, do not make one, where its sections are not
-        convex, or where it has more segments.
+        The tube; None if the surface is not one of nearly flat quads with flat ends, if sections are not convex, or if
+        more segments are needed.
     """
     pairs, corners = _quads(points, triangles)
     if not len(pairs):
         return None
     quad_at = {edge: divmod(k, 4) for k, edge in enumerate(_sides(corners))}
     for direction in range(2):
-        steps, is_closed = _traverse_quads(corners, quad_at, 0, direction)
+        steps, is_closed = _quad_strip(corners, quad_at, 0, direction)
         if not is_closed:
-            backward, _ = _traverse_quads(corners, quad_at, 0, direction + 2)
+            backward, _ = _quad_strip(corners, quad_at, 0, direction + 2)
             steps = [(quad, (side + 2) % 4) for quad, side in backward[:0:-1]] + steps
         rings = [ring for ring in itertools.starmap(functools.partial(_ring, corners, quad_at), steps) if ring]
         if len(rings) == len(steps) and _covers(triangles, pairs, rings, is_closed):
             sections = np.array([rings[0].back, *(ring.front for ring in rings)])
             volumes = [_volume(points, _lofted(*pair)) for pair in itertools.pairwise(sections)]
             if min(volumes) > 0 and abs(sum(volumes) / _volume(points, triangles) - 1) < _MAX_TWIST:
-                return _straightened(points, sections, maximum)
+                return _simplified(points, sections, maximum)
     return None
 
 
 def _lofted(section: np.ndarray, next_section: np.ndarray) -> np.ndarray:
-    """Triangles of the solid between two sections, shape [triangle, 3]."""
+    """Triangles of the loft between two sections, shape [triangle, 3]."""
     turned, next_turned = np.roll(section, -1), np.roll(next_section, -1)
     sides = [[section, next_turned, turned], [section, next_section, next_turned]]
     rest = np.arange(1, len(section) - 1)
@@ -82,26 +82,26 @@ def _lofted(section: np.ndarray, next_section: np.ndarray) -> np.ndarray:
 
 
 def _volume(points: np.ndarray, triangles: np.ndarray) -> float:
-    """Volume that triangles enclose, below 0 where they face inward."""
+    """Signed volume that triangles enclose, negative if they face inward."""
     return float(np.linalg.det(points[triangles] - points[triangles[0, 0]]).sum() / 6)
 
 
 def _bulge(points: np.ndarray, section: np.ndarray, next_section: np.ndarray, middle_sections: np.ndarray) -> float:
-    """Largest distance of sections from the straight lines between two others."""
+    """Largest distance of intermediate sections from the straight lines between two others."""
     starts, lines = points[section], points[next_section] - points[section]
     units = lines / np.linalg.norm(lines, axis=1, keepdims=True)
     return float(np.linalg.norm(np.cross(points[middle_sections] - starts, units), axis=-1).max(initial=0.0))
 
 
 def _swell(radii: np.ndarray, chosen: np.ndarray) -> float:
-    """Largest part by which radii of sections, [section, corner], differ from those between chosen ones."""
+    """Largest relative deviation of radii [section, corner] from those interpolated between chosen sections."""
     places = np.arange(len(radii))
     expected = np.stack([np.interp(places, chosen, column) for column in radii[chosen].T], axis=1)
     return float(np.abs(radii / expected - 1).max())
 
 
-def _straightened(points: np.ndarray, sections: np.ndarray, maximum: int) -> Tube | None:
-    """The tube of as few of the sections as there may be, about as many apart; None if they are too many."""
+def _simplified(points: np.ndarray, sections: np.ndarray, maximum: int) -> Tube | None:
+    """The tube of the fewest evenly spaced sections that approximate it; None if that takes more than the maximum."""
     middles = points[sections].mean(axis=1)
     radii, last = np.linalg.norm(points[sections] - middles[:, None], axis=2), len(sections) - 1
     for count in range(1, min(maximum, last) + 1):
@@ -124,7 +124,7 @@ def _straightened(points: np.ndarray, sections: np.ndarray, maximum: int) -> Tub
 
 
 def _hull(points: np.ndarray, sections: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Triangles of the convex hull of two sections, which wind alike, shape [triangle, 3]."""
+    """Triangles of the convex hull of two sections, consistently wound, shape [triangle, 3]."""
     from scipy.spatial import ConvexHull
 
     vertices = np.unique(sections)
@@ -137,10 +137,10 @@ def _hull(points: np.ndarray, sections: tuple[np.ndarray, np.ndarray]) -> np.nda
 
 
 def _quads(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of triangles that are nearly in a plane and share their longest edge, and the corners of each in order.
+    """Pair nearly coplanar triangles that share their longest edge into quads.
 
     Returns:
-        Numbers of the triangles, [quad, 2], and the corners, [quad, 4].
+        Indices of both triangles, [quad, 2], and corners in order, [quad, 4].
     """
     corners, edges, count = points[triangles], edges_of(triangles), len(triangles)
     normals = area_normals(corners)
@@ -157,15 +157,15 @@ def _quads(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _sides(corners: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Sides of quads, four of each: that from one corner to the next."""
+    """The four directed sides of each quad."""
     return map(tuple, np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2).tolist())
 
 
-def _traverse_quads(
+def _quad_strip(
     corners: np.ndarray, quad_at: dict[tuple[int, int], tuple[int, int]], quad: int, side: int
 ) -> tuple[list[tuple[int, int]], bool]:
-    """Walk from a quad out of a side of it, straight on: quads and the sides by which each is left; whether it ends
-    where it began.
+    """Follow the strip of quads that leaves a quad through a side: each quad with the side through which the strip
+    leaves it, and whether the strip closes.
     """
     steps = [(quad, side % 4)]
     seen = {quad}
@@ -181,8 +181,8 @@ def _traverse_quads(
 
 
 def _ring(corners: np.ndarray, quad_at: dict[tuple[int, int], tuple[int, int]], quad: int, side: int) -> _Ring | None:
-    """The ring across a tube of a quad that is left by a side on the way along it; None if it does not close."""
-    steps, is_closed = _traverse_quads(corners, quad_at, quad, side + 1)
+    """The ring of quads around a tube through a quad, whose side faces along the tube; None if it does not close."""
+    steps, is_closed = _quad_strip(corners, quad_at, quad, side + 1)
     if not is_closed:
         return None
     quads, sides = np.array(steps).T
@@ -190,7 +190,7 @@ def _ring(corners: np.ndarray, quad_at: dict[tuple[int, int], tuple[int, int]], 
 
 
 def _covers(triangles: np.ndarray, pairs: np.ndarray, rings: list[_Ring], is_closed: bool) -> bool:
-    """Whether rings one after another are all of the surface, but for flat ends."""
+    """Whether rings cover all of the surface but flat ends."""
     quads = list(itertools.chain.from_iterable(ring.quads for ring in rings))
     if len(set(quads)) != len(quads) or len({len(ring.quads) for ring in rings}) > 1:
         return False
