@@ -4,15 +4,18 @@ import contextlib
 import itertools
 import mmap
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import warp as wp
 
+import warpshadow as ws
 from warpshadow.device import memory
 from warpshadow.device.memory import in_huge_pages, require_gradient
 from warpshadow.device.tape import recorded
 from warpshadow.device.warp_internals import check_strides
+from warpshadow.pipeline import renderer as renderer_module
 
 SIZE = 2**24
 MAPPINGS = Path("/proc/self/smaps")
@@ -133,3 +136,26 @@ def test_scratch_memory_is_zero_in_recordings_and_outside(device):
             assert scratch.shape == (4, 5) and scratch.dtype is wp.int64 and not scratch.numpy().any()
             scratch.fill_(3)  # of which others see nothing
             assert not memory.zeros((4, 5), wp.int64, device, outlives_recording=False).numpy().any()
+
+
+@pytest.mark.parametrize(
+    ("is_cuda", "is_enabled", "before", "after"),
+    [(True, True, 0, 2**30), (True, True, 5, 5), (True, False, 0, 0), (False, True, 0, 0)],
+)
+def test_a_gpus_memory_pool_keeps_freed_memory_unless_it_was_told_how_much(
+    is_cuda, is_enabled, before, after, monkeypatch
+):
+    thresholds = [before]
+    monkeypatch.setattr(wp, "is_mempool_enabled", lambda device: is_enabled)
+    monkeypatch.setattr(wp, "get_mempool_release_threshold", lambda device: thresholds[-1])
+    monkeypatch.setattr(wp, "set_mempool_release_threshold", lambda device, threshold: thresholds.append(threshold))
+    memory.keep_pool(SimpleNamespace(is_cuda=is_cuda))
+    assert thresholds[-1] == after
+
+
+def test_a_renderer_keeps_the_pool_of_its_device(device, monkeypatch):
+    devices = []
+    monkeypatch.setattr(renderer_module, "keep_pool", devices.append)
+    scene = ws.Scene([ws.Body(ws.plane(2.0))], ws.synthetic_sky())
+    renderer_module.SceneRenderer(scene, device=device)
+    assert devices == [wp.get_device(device)]

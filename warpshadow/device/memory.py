@@ -32,6 +32,8 @@ _ALIGNMENT = 256  # bytes at whose multiples arrays in a block begin, as CUDA's 
 _MAX_SHARED = 2**28  # bytes of a block; larger arrays have memory of their own
 _MAX_SIZES = 256  # kinds of recordings whose sizes are kept
 
+_POOL_BYTES = 2**30  # freed memory that a GPU's pool keeps
+
 
 @functools.cache
 def _advise() -> Callable[[int, int, int], int] | None:
@@ -53,6 +55,15 @@ def in_huge_pages(array: wp.array) -> wp.array:
         first, end = -(-array.ptr // _HUGE) * _HUGE, (array.ptr + size) // _HUGE * _HUGE
         advise(first, end - first, mmap.MADV_HUGEPAGE)
     return array
+
+
+def keep_pool(device: wp.Device) -> None:
+    """Let the memory pool of a GPU keep up to 1 GB of freed memory, unless the pool already keeps some.
+
+    By default CUDA gives all of it back to the system whenever the host waits for the device, as each iteration does.
+    """
+    if device.is_cuda and wp.is_mempool_enabled(device) and not wp.get_mempool_release_threshold(device):
+        wp.set_mempool_release_threshold(device, _POOL_BYTES)
 
 
 def zeros(

@@ -16,6 +16,7 @@ from warpshadow.assets.basis import Basis
 from warpshadow.assets.camera import Camera
 from warpshadow.assets.light import KnownLightArgument
 from warpshadow.device.array_checks import finite_arrays
+from warpshadow.device.memory import keep_pool
 from warpshadow.device.progress import waiting
 from warpshadow.device.tape import unrecorded
 from warpshadow.device.threads import locked, with_lock_and_progress
@@ -103,6 +104,7 @@ class SceneRenderer:
         self.has_camera_batch = cameras is not None
         self.cameras = (scene.camera,) if cameras is None else camera_batch(cameras)
         self.device = where
+        keep_pool(where)
         self.progress = progress
         with waiting("preparing", shows=progress):
             merged_scene = MergedScene(scene, device=self.device, progress=progress)
