@@ -857,9 +857,10 @@ def test_gradients_of_sums_of_lobes_are_exact(quantity, double, device, check):
 
 @pytest.mark.parametrize("quantity", ["radiance", "fresnel_weights", "blurs"])
 def test_gradients_of_the_light_of_mirrored_bodies_are_exact(quantity, double, device, check):
-    """Of samples that meet a face, whose mirrored ray meets the sky, a body, or leaves below it, and that meet none."""
+    """Of samples that meet no face, one or two, whose last ray meets the sky, a body, or leaves below the face."""
     module = double("stages.gloss.mirrored")
-    hits = np.int32([[[0, 0, -1], [1, -1, 1]]]), np.abs(random(0, 1, 2, 3, 3)), unit(random(1, 1, 2, 3, 3))
+    face_ids = np.int32([[[[0, 0, -1], [1, -1, 1]], [[1, -1, -1], [0, -1, -1]]]])
+    hits = face_ids, np.abs(random(0, 1, 2, 2, 3, 3)), unit(random(1, 1, 2, 2, 3, 3))
     dtypes = wp.int32, wp.vec3d, wp.vec3d, wp.int32, wp.vec3d
     last_rays, points = np.int32([[[0, 1, 1], [2, 2, 0]]]), np.zeros((1, 2, 3, 3))
     hits = double("stages.gloss.lobe_hits").LobeHits(
@@ -888,14 +889,14 @@ def test_gradients_of_the_radiosity_of_mirrored_planes_are_exact(double, planes,
     of_faces = texels.find_face_texels(planes, [body._replace(grid=grid) for body in bodies], [0, 2], 4, 8)
     sides = np.int32([[[0, 3, 7]]])
     dtypes = wp.int32, wp.vec3d, wp.vec3d, wp.int32, wp.vec3d
-    hits = sides, np.array([[[[0.3, 0.5, 0.2], [0.1, 0.3, 0.6], [0.4, 0.35, 0.25]]]]), np.zeros((1, 1, 3, 3))
+    hits = sides[None], np.array([[[[[0.3, 0.5, 0.2], [0.1, 0.3, 0.6], [0.4, 0.35, 0.25]]]]]), np.zeros((1, 1, 1, 3, 3))
     hits = double("stages.gloss.lobe_hits").LobeHits(
-        *(put(v, t, device) for v, t in zip((*hits, 1 + 0 * sides, hits[2]), dtypes, strict=True))
+        *(put(v, t, device) for v, t in zip((*hits, 1 + 0 * sides, hits[2][0]), dtypes, strict=True))
     )
     all_faces = put(np.concatenate([faces, faces + 4] * 2), wp.vec3i, device)
     constants = put(random(0, 1, 8, 3), wp.vec3d, device), put(np.zeros((1, 8)), wp.float64, device)
     light, mean = (put(random(seed, 1, 1, 3, 3), wp.vec3d, device) for seed in (1, 2))
-    fresnel_weights = put(random(3, 1, 1, 3), wp.float64, device)
+    fresnel_weights = put(random(3, 1, 1, 1, 3), wp.float64, device)
     share = put(np.array([[[0.1, 0.3, 0.6]]]), wp.float64, device)
 
     def mix(radiosity):

@@ -397,6 +397,23 @@ def test_a_metal_mirrors_a_red_and_a_blue_part_of_a_floor_each_in_its_place(rend
 
 
 @pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render(), by_paths])
+def test_a_metal_shows_what_a_metal_in_it_mirrors(render):
+    """A periscope, whose upper mirror sees a red ball alone; the lower one is lit as much by a blue one."""
+    mirrors = [
+        ws.Body(ws.plane(2.0), (1, 1, 1), rotation=(angle, 0, 0), translation=(0, y, 0), roughness=0.1, metallic=1.0)
+        for angle, y in ((45, 0), (135, 2))
+    ]
+    balls = [
+        ws.Body(ws.icosphere(0.6, 3), color, translation=position)
+        for color, position in (((0.8, 0.1, 0.1), (0, 2, 3)), ((0.1, 0.1, 0.8), (0, 3, 2)))
+    ]
+    camera = ws.Camera.look_at((0, 0, 5), (0, 0, 0), fov_y=4, size=(8, 8))
+    image = render(ws.Scene([*balls, *mirrors], ws.EnvironmentMap.constant(1.0), camera, bounces=1))[..., :3]
+    red, _, blue = image.mean(axis=(0, 1))
+    assert red > 3 * blue
+
+
+@pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render(), by_paths])
 def test_a_metal_mirrors_no_body_that_blocks_no_light(render):
     """A green sheet above a red floor, which the metal shows through it."""
     floor = ws.Body(ws.plane(4.0), (0.8, 0.1, 0.1), name="floor")

@@ -1,6 +1,7 @@
 """Bodies that lobes meet, against NumPy: a mirror and a wall that face each other, and receivers between them."""
 
 import numpy as np
+import pytest
 import twins
 import warp as wp
 
@@ -26,12 +27,20 @@ def put(values, dtype, device):
     return wp.array(np.asarray(values), dtype=dtype, device=device)
 
 
-def hits_of(device, transmittance=0.0, points=POINTS, normals=UP, directions=DIRECTIONS, light_of_face=(2, 2, 0, 0)):
+def hits_of(
+    device,
+    transmittance=0.0,
+    points=POINTS,
+    normals=UP,
+    directions=DIRECTIONS,
+    light_of_face=(2, 2, 0, 0),
+    reflections=1,
+):
     mesh = wp.Mesh(put(POSITIONS, wp.vec3, device), put(FACES.ravel(), wp.int32, device))
     arrays = [put(values, wp.vec3, device) for values in (NORMALS, points, normals, directions)]
     through = wp.full((2, 3), transmittance, dtype=wp.float32, device=device)
     light_of_face, faces = put(light_of_face, wp.int32, device), put([*FACES, *FACES], wp.vec3i, device)
-    return lobe_hits.trace_hits(mesh, light_of_face, faces, *arrays, through), faces
+    return lobe_hits.trace_hits(mesh, light_of_face, faces, *arrays, through, reflections), faces
 
 
 def expected_hits():
@@ -52,9 +61,9 @@ def expected_hits():
 def test_samples_meet_the_mirror_alone_and_see_what_its_normals_mirror(device):
     hits, _ = hits_of(device)
     meets, normals, is_open, _, places = expected_hits()
-    np.testing.assert_array_equal(hits.face_ids.numpy() >= 0, meets)
+    np.testing.assert_array_equal(hits.face_ids.numpy()[0] >= 0, meets)
     assert meets.sum() == 3 and set(is_open[meets]) == {True, False}
-    np.testing.assert_allclose(hits.normals.numpy()[meets], normals[meets], atol=FLOAT32)
+    np.testing.assert_allclose(hits.normals.numpy()[0, meets], normals[meets], atol=FLOAT32)
     np.testing.assert_array_equal(hits.last_rays.numpy()[meets] == lobe_hits.MEETS_SKY, is_open[meets])
     assert (hits.last_rays.numpy() != lobe_hits.LEAVES_BELOW).all()
     expected = np.where(meets[..., None], places, POINTS[:, None])
@@ -98,13 +107,13 @@ def test_metals_send_the_light_that_they_mirror_in_their_color(device):
     radiance, towards = mixed(device, batched(hits), faces, *arrays)
     meets, normals, is_open, expected_towards, _ = expected_hits()
     roughness, _, blurs, albedo, metallic, mean, through = (array.numpy()[0] for array in arrays)
-    weights, corners = hits.barycentrics.numpy()[meets], faces.numpy()[hits.face_ids.numpy()[meets]]
+    weights, corners = hits.barycentrics.numpy()[0, meets], faces.numpy()[hits.face_ids.numpy()[0, meets]]
     rough, color, share = (
         np.einsum("hc,hc...->h...", weights, values[corners]) for values in (roughness, albedo, metallic)
     )
     grazing = (1 - np.abs((DIRECTIONS * normals).sum(axis=-1)[meets])) ** 5
     blur = np.sqrt(blurs[meets] ** 2 + 2 * rough**4)
-    np.testing.assert_allclose(towards.fresnel_weights.numpy()[0][meets], grazing, rtol=1e-4)
+    np.testing.assert_allclose(towards.fresnel_weights.numpy()[0, 0][meets], grazing, rtol=1e-4)
     np.testing.assert_allclose(towards.blurs.numpy()[0][meets], blur, rtol=1e-4)
     np.testing.assert_allclose(towards.directions.numpy()[0][meets], expected_towards[meets], atol=FLOAT32)
     of_receivers = np.broadcast_to(mean[:, None], (2, 3, 3))
@@ -128,13 +137,50 @@ def test_bodies_that_are_no_metals_send_the_radiosity_of_the_side_that_samples_m
             device, points=points, directions=twins.unit(directions.copy()), light_of_face=(0, 0, 1, 1)
         )
         radiance, _ = mixed(device, batched(hits), faces, *arrays, radiosity=put(radiosity, wp.vec3, device))
-        numbers = hits.face_ids.numpy()
+        numbers = hits.face_ids.numpy()[0]
         assert (numbers[:, :2] >= 2).all() and (numbers[:, 2] == -1).all()
         sent.append(numbers[:, :2] // 4)
         mean, through = arrays[5].numpy()[0], arrays[6].numpy()[0]
         expected = (1 - through[..., None]) * (radiosity[0][numbers] - mean[:, None])
         np.testing.assert_allclose(radiance.numpy()[0, :, :2], expected[:, :2], atol=10 * FLOAT32)
     assert (sent[0] != sent[1]).all()
+
+
+@pytest.mark.parametrize("wall", [lobe_hits.SENDS, lobe_hits.MIRRORS, 0])
+def test_a_metal_shows_the_body_that_it_mirrors(wall, device):
+    """The wall, which sends its radiosity, or mirrors the sky past the mirror; else the mean radiance of blockers."""
+    directions = twins.unit(np.array([[[1, -0.2, 0], [1, -0.3, -0.1], [1, -0.4, 0.1]]] * 2))
+    towards_mirror = np.array([[1.0, 0, 0]] * 2)
+    hits, faces = hits_of(
+        device, 0.0, POINTS, towards_mirror, directions, light_of_face=(2, 2, wall, wall), reflections=2
+    )
+    arrays, radiosity = inputs_of(device), np.random.default_rng(1).uniform(size=(1, 8, 3))
+    arrays[1] = put(directions[None], wp.vec3, device)
+    radiance, towards = mixed(device, batched(hits), faces, *arrays, radiosity=put(radiosity, wp.vec3, device))
+    roughness, _, blurs, albedo, metallic, mean, through = (array.numpy()[0] for array in arrays)
+    numbers, corners = hits.face_ids.numpy(), faces.numpy()[hits.face_ids.numpy()]
+    assert np.isin(numbers[0], (0, 1)).all() and (np.isin(numbers[1], (2, 3)) == (wall != 0)).all()
+    values = (roughness, albedo, metallic)
+    barycentrics = np.where(numbers[..., None] >= 0, hits.barycentrics.numpy(), 0)
+    rough, color, share = (np.einsum("krsc,krsc...->krs...", barycentrics, each[corners]) for each in values)
+    ray, fresnel = directions, []
+    for normals, is_met in zip(hits.normals.numpy(), numbers >= 0, strict=True):
+        cosines = np.where(is_met, (ray * normals).sum(axis=-1), 0)[..., None]
+        fresnel.append((1 - np.abs(cosines)) ** 5)
+        ray = ray - 2 * cosines * np.where(is_met[..., None], normals, 0)
+    np.testing.assert_allclose(towards.directions.numpy()[0], ray, atol=FLOAT32)
+    blur = np.sqrt(blurs**2 + 2 * (rough**4).sum(axis=0))
+    np.testing.assert_allclose(towards.blurs.numpy()[0], blur, rtol=1e-5)
+    last, means = hits.last_rays.numpy()[..., None], np.broadcast_to(mean[:, None], (2, 3, 3))
+    expected_rays = {lobe_hits.MEETS_BODY} | ({lobe_hits.MEETS_SKY} if wall == lobe_hits.MIRRORS else set())
+    assert set(last.ravel()) == expected_rays
+    seen = np.where(last == lobe_hits.MEETS_SKY, ray, np.where(last == lobe_hits.LEAVES_BELOW, 0, means))
+    for k in (1, 0):
+        mirrored_light = (color[k] + (1 - color[k]) * fresnel[k]) * seen
+        shown = share[k][..., None] * mirrored_light + (1 - share[k][..., None]) * radiosity[0][numbers[k]]
+        seen = np.where((numbers[k] >= 0)[..., None], shown, seen)
+    expected = (1 - through[..., None]) * (seen - means)
+    np.testing.assert_allclose(radiance.numpy()[0], expected, atol=10 * FLOAT32)
 
 
 def test_no_light_comes_from_below_the_face_that_a_ray_leaves(device):
@@ -145,11 +191,11 @@ def test_no_light_comes_from_below_the_face_that_a_ray_leaves(device):
     hits, faces = hits_of(device, 0.0, points, normals, directions)
     is_below = np.array([[True, True, False], [True, False, False]])
     np.testing.assert_array_equal(hits.last_rays.numpy() == lobe_hits.LEAVES_BELOW, is_below)
-    np.testing.assert_array_equal(hits.face_ids.numpy()[is_below] >= 0, [True, True, False])
+    np.testing.assert_array_equal(hits.face_ids.numpy()[0, is_below] >= 0, [True, True, False])
     arrays = inputs_of(device)
     metallic, mean, through = (array.numpy()[0] for array in arrays[4:])
     radiance = mixed(device, batched(hits), faces, *arrays)[0].numpy()[0]
-    weights, corners = hits.barycentrics.numpy()[0, :2], FACES[hits.face_ids.numpy()[0, :2]]
+    weights, corners = hits.barycentrics.numpy()[0, 0, :2], FACES[hits.face_ids.numpy()[0, 0, :2]]
     shares = np.append((weights * metallic[corners]).sum(axis=1), 1.0)
     expected = -((1 - through[is_below]) * shares)[:, None] * mean[[0, 0, 1]]
     np.testing.assert_allclose(radiance[is_below], expected, atol=10 * FLOAT32)

@@ -22,7 +22,7 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Node, detached, field_of
 from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
-from warpshadow.stages.gloss.lobe_hits import HIT_TYPES, MIRRORS, SENDS, LobeHits, trace_hits
+from warpshadow.stages.gloss.lobe_hits import HIT_TYPES, MIRRORS, REFLECTIONS, SENDS, LobeHits, hit_shapes, trace_hits
 from warpshadow.stages.gloss.mirrored import mirror, mix_mirrored
 from warpshadow.stages.planes.face_texels import FaceTexels
 from warpshadow.stages.receivers.find import Receivers
@@ -124,11 +124,12 @@ class MirroredBodies:
         directions: wp.array,
         transmittance: wp.array,
     ) -> LobeHits:
-        """Trace all instances: arrays of shape [batch, receiver, sample]."""
+        """Trace all instances: arrays of batches."""
         merged_scene = self._merged_scene
         light_of_bodies = np.zeros(len(merged_scene.scene.bodies), np.int32)
         light_of_bodies[[*shown.nonmetals]], light_of_bodies[[*shown.mirrors]] = SENDS, MIRRORS
         light_of_face = constant(light_of_bodies[merged_scene.body_of_face], wp.int32, positions.device)
+        reflections = REFLECTIONS if shown.mirrors else 1
         hits = [
             trace_hits(
                 self._refitted(instance_of(positions, instance)),
@@ -139,10 +140,15 @@ class MirroredBodies:
                 instance_of(receivers.normals, instance),
                 instance_of(directions, instance),
                 instance_of(transmittance, instance),
+                reflections,
             )
             for instance in range(len(directions) if directions.size else 0)
         ]
-        joined = [wp.empty(directions.shape, dtype=dtype, device=directions.device) for dtype in HIT_TYPES]
+        shapes = hit_shapes(reflections, *directions.shape[1:])
+        joined = [
+            wp.empty((len(directions), *shape), dtype=dtype, device=directions.device)
+            for shape, dtype in zip(shapes, HIT_TYPES, strict=True)
+        ]
         for array, parts in zip(joined, zip(*hits, strict=True), strict=False):
             for instance, part in enumerate(parts):
                 wp.copy(array[instance], part)

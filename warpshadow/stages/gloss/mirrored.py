@@ -3,14 +3,14 @@
 A sample l of a lobe, of transmittance T, meets a body at a point with normal n, which mirrors l' = l − 2 (n·l) n. To
 the mean radiance R̄ of the receiver's blockers the point adds
 
-    M = (1 − T) (m F L' + (1 − m) B − R̄),   F = a + (1 − a) (1 − |n·l|)⁵,
+    M = (1 − T) (S − R̄),   S = m F L' + (1 − m) B,   F = a + (1 − a) (1 − |n·l|)⁵,
 
 m how metallic it is, a its albedo, B the radiosity there (:mod:`warpshadow.stages.planes.face_texels`), and L' the
-radiance from l': R̄ where that ray meets a body, 0 where it leaves below the face that it starts on
-(:mod:`.lobe_hits`), else L, light without shadows, blurred by σ'² = σ² + 2 α², since variances of Gaussians add: σ is
-the blur of the sample (:mod:`.lobes`), and √2 α the σ of a lobe's only sample, N = K = 1, seen from above, v = h = n,
-where |W| = α² and μ = Λ = 1.
-Where l itself leaves below the receiver's face, M = −(1 − T) R̄.
+radiance from l': if a metal sends that ray to a second body (:mod:`.lobe_hits`), S of that; else R̄ where the ray meets
+a body, 0 where it leaves below the face that it starts on, and L, light without shadows, where it meets the sky. L is
+blurred by σ'² = σ² + 2 α² for each metal on the way, since variances of Gaussians add: σ is the blur of the sample
+(:mod:`.lobes`), and √2 α the σ of a lobe's only sample, N = K = 1, seen from above, v = h = n, where |W| = α² and
+μ = Λ = 1. Where l itself leaves below the receiver's face, M = −(1 − T) R̄.
 """
 
 from typing import NamedTuple
@@ -30,53 +30,84 @@ _COST = 20.0  # nanoseconds that a sample takes
 wp.set_module_options({"max_unroll": 1})
 
 
+@wp.func
+def _reflect(
+    direction: wp.vec3,
+    square: float,
+    face: int,
+    weights: wp.vec3,
+    normal: wp.vec3,
+    faces: wp.array(dtype=wp.vec3i),
+    roughness: wp.array(dtype=wp.float32),
+):
+    """Reflect a ray from a body: its direction, the square of its blur, and (1 − |n·l|)⁵. Without a face as it is."""
+    fresnel_weight = float(0.0)
+    if face >= 0:
+        width = wp.max(interpolate_at(roughness, faces[face], weights), MIN_ROUGHNESS)
+        width = width * width
+        square = square + 2.0 * width * width
+        cosine = wp.dot(normal, direction)
+        fresnel_base = 1.0 - wp.min(wp.abs(cosine), 1.0)
+        fresnel_weight = fresnel_base * fresnel_base * fresnel_base * fresnel_base * fresnel_base
+        direction = direction - 2.0 * cosine * normal
+    return direction, square, fresnel_weight
+
+
 @wp.kernel
 def _mirror(
     first_row: int,
     worker: int,
     # in
-    face_ids: wp.array3d(dtype=wp.int32),
-    barycentrics: wp.array3d(dtype=wp.vec3),
-    hit_normals: wp.array3d(dtype=wp.vec3),
+    face_ids: wp.array4d(dtype=wp.int32),
+    barycentrics: wp.array4d(dtype=wp.vec3),
+    hit_normals: wp.array4d(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
     roughness: wp.array2d(dtype=wp.float32),
     directions: wp.array3d(dtype=wp.vec3),
     blurs: wp.array3d(dtype=wp.float32),
     # out
     mirrored: wp.array3d(dtype=wp.vec3),
-    fresnel_weights: wp.array3d(dtype=wp.float32),
+    fresnel_weights: wp.array4d(dtype=wp.float32),
     mirrored_blurs: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a sample."""
     row, sample = wp.tid()
     batch, receiver = split_row(first_row + row, mirrored.shape[1])
-    direction = directions[instance_in(batch, directions.shape[0]), receiver, sample]
-    blur = blurs[instance_in(batch, blurs.shape[0]), receiver, sample]
-    fresnel_weight = float(0.0)
     hit_batch = instance_in(batch, face_ids.shape[0])
-    face = face_ids[hit_batch, receiver, sample]
-    if face >= 0:
-        weights = barycentrics[hit_batch, receiver, sample]
-        normal = hit_normals[hit_batch, receiver, sample]
-        rough = interpolate_at(roughness[instance_in(batch, roughness.shape[0])], faces[face], weights)
-        width = wp.max(rough, MIN_ROUGHNESS)
-        width = width * width
-        blur = wp.sqrt(blur * blur + 2.0 * width * width)
-        cosine = wp.dot(normal, direction)
-        fresnel_base = 1.0 - wp.min(wp.abs(cosine), 1.0)
-        fresnel_weight = fresnel_base * fresnel_base * fresnel_base * fresnel_base * fresnel_base
-        direction = direction - 2.0 * cosine * normal
-    mirrored[batch, receiver, sample] = direction
-    fresnel_weights[batch, receiver, sample] = fresnel_weight
-    mirrored_blurs[batch, receiver, sample] = blur
+    of_vertices = roughness[instance_in(batch, roughness.shape[0])]
+    blur = blurs[instance_in(batch, blurs.shape[0]), receiver, sample]
+    direction, square, fresnel_weight = _reflect(
+        directions[instance_in(batch, directions.shape[0]), receiver, sample],
+        blur * blur,
+        face_ids[hit_batch, 0, receiver, sample],
+        barycentrics[hit_batch, 0, receiver, sample],
+        hit_normals[hit_batch, 0, receiver, sample],
+        faces,
+        of_vertices,
+    )
+    fresnel_weights[batch, 0, receiver, sample] = fresnel_weight
+    last_direction, last_square = direction, square
+    if face_ids.shape[1] > 1:
+        last_direction, last_square, last_fresnel_weight = _reflect(
+            direction,
+            square,
+            face_ids[hit_batch, 1, receiver, sample],
+            barycentrics[hit_batch, 1, receiver, sample],
+            hit_normals[hit_batch, 1, receiver, sample],
+            faces,
+            of_vertices,
+        )
+        fresnel_weights[batch, 1, receiver, sample] = last_fresnel_weight
+    mirrored[batch, receiver, sample] = last_direction
+    mirrored_blurs[batch, receiver, sample] = wp.sqrt(last_square)
 
 
 class MirroredDirections(NamedTuple):
     """Directions from which the bodies that lobes meet mirror light; samples that meet none keep their own."""
 
-    directions: wp.array  # l', vec3 of shape [batch, receiver, sample]
-    fresnel_weights: wp.array  # (1 − |n·l|)⁵, float32 of the same shape
-    blurs: wp.array  # σ' [radians], float32 of the same shape
+    directions: wp.array  # of the last rays, vec3 of shape [batch, receiver, sample]
+    fresnel_weights: wp.array  # (1 − |n·l|)⁵ of each reflection, float32 of shape [batch, reflection, receiver, sample]
+    blurs: wp.array  # σ' [radians], float32 of shape [batch, receiver, sample]
 
 
 def mirror(
@@ -85,7 +116,7 @@ def mirror(
     """Find the directions that the points mirror.
 
     Args:
-        hits: Of :func:`.lobe_hits.trace_hits`, of all instances, [batch, receiver, sample].
+        hits: Of :func:`.lobe_hits.trace_hits`, of all instances.
         faces: Vertices of the sides of its faces, vec3i of shape [2 · face].
         roughness: Of the vertices, float32 of shape [batch, vertex].
         directions, blurs: Of :func:`.lobes.sample_lobes`. Any batch may be 1 and then serves every instance.
@@ -94,8 +125,9 @@ def mirror(
     """
     arrays = {"directions": directions, "blurs": blurs, "roughness": roughness, "hits": hits.face_ids}
     shape = common_batch(arrays), *directions.shape[1:]
-    dtypes = wp.vec3, wp.float32, wp.float32
-    result = MirroredDirections(*(wp.empty(shape, dtype=dtype, device=directions.device) for dtype in dtypes))
+    of_reflections = shape[0], *hits.face_ids.shape[1:]
+    kinds = (shape, wp.vec3), (of_reflections, wp.float32), (shape, wp.float32)
+    result = MirroredDirections(*(wp.empty(*kind, device=directions.device) for kind in kinds))
     of_hits = [hits.face_ids, hits.barycentrics, hits.normals]
     launch(
         _mirror,
@@ -108,18 +140,44 @@ def mirror(
     return result
 
 
+@wp.func
+def _shine(
+    seen: wp.vec3,
+    diffuse: wp.vec3,
+    face: int,
+    weights: wp.vec3,
+    fresnel_weight: float,
+    faces: wp.array(dtype=wp.vec3i),
+    albedo: wp.array(dtype=wp.vec3),
+    metallic: wp.array(dtype=wp.float32),
+    radiosity: wp.array2d(dtype=wp.vec3),
+    radiosity_batch: int,
+    texels: FaceTexels,
+):
+    """Radiance S of a body that sees another; without a face that of the other. Diffuse is B if it is not known."""
+    result = seen
+    if face >= 0:
+        color = interpolate_at(albedo, faces[face], weights)
+        metal_share = interpolate_at(metallic, faces[face], weights)
+        fresnel = color + fresnel_weight * (wp.vec3(1.0) - color)
+        if radiosity:
+            diffuse = radiosity_at(radiosity[radiosity_batch], texels, faces, face, weights)
+        result = metal_share * wp.cw_mul(fresnel, seen) + (1.0 - metal_share) * diffuse
+    return result
+
+
 @wp.kernel
 def _mix_mirrored(
     first_row: int,
     worker: int,
     # in
-    face_ids: wp.array3d(dtype=wp.int32),
-    barycentrics: wp.array3d(dtype=wp.vec3),
+    face_ids: wp.array4d(dtype=wp.int32),
+    barycentrics: wp.array4d(dtype=wp.vec3),
     last_rays: wp.array3d(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     albedo: wp.array2d(dtype=wp.vec3),
     metallic: wp.array2d(dtype=wp.float32),
-    fresnel_weights: wp.array3d(dtype=wp.float32),
+    fresnel_weights: wp.array4d(dtype=wp.float32),
     light: wp.array3d(dtype=wp.vec3),
     mean_radiance: wp.array2d(dtype=wp.vec3),
     transmittance: wp.array3d(dtype=wp.float32),
@@ -132,28 +190,51 @@ def _mix_mirrored(
     row, sample = wp.tid()
     batch, receiver = split_row(first_row + row, radiance.shape[1])
     hit_batch = instance_in(batch, face_ids.shape[0])
-    face = face_ids[hit_batch, receiver, sample]
+    face = face_ids[hit_batch, 0, receiver, sample]
     last_ray = last_rays[hit_batch, receiver, sample]
-    blocked = 1.0 - transmittance[instance_in(batch, transmittance.shape[0]), receiver, sample]
-    mean = mean_radiance[instance_in(batch, mean_radiance.shape[0]), receiver]
     result = wp.vec3(0.0)
-    if face < 0 and last_ray == LEAVES_BELOW:
-        result = -blocked * mean
-    if face >= 0:
-        weights = barycentrics[hit_batch, receiver, sample]
-        color = interpolate_at(albedo[instance_in(batch, albedo.shape[0])], faces[face], weights)
-        metal_share = interpolate_at(metallic[instance_in(batch, metallic.shape[0])], faces[face], weights)
-        fresnel_weight = fresnel_weights[instance_in(batch, fresnel_weights.shape[0]), receiver, sample]
+    if face >= 0 or last_ray == LEAVES_BELOW:
+        fresnel_batch = instance_in(batch, fresnel_weights.shape[0])
+        of_albedo = albedo[instance_in(batch, albedo.shape[0])]
+        of_metallic = metallic[instance_in(batch, metallic.shape[0])]
+        radiosity_batch = int(0)
+        if radiosity:
+            radiosity_batch = instance_in(batch, radiosity.shape[0])
+        mean = mean_radiance[instance_in(batch, mean_radiance.shape[0]), receiver]
         seen = mean
         if last_ray == MEETS_SKY:
             seen = light[instance_in(batch, light.shape[0]), receiver, sample]
         if last_ray == LEAVES_BELOW:
             seen = wp.vec3()
-        fresnel = color + fresnel_weight * (wp.vec3(1.0) - color)
-        diffuse = mean
-        if radiosity:
-            diffuse = radiosity_at(radiosity[instance_in(batch, radiosity.shape[0])], texels, faces, face, weights)
-        result = blocked * (metal_share * wp.cw_mul(fresnel, seen) + (1.0 - metal_share) * diffuse - mean)
+        if face_ids.shape[1] > 1:
+            seen = _shine(
+                seen,
+                mean,
+                face_ids[hit_batch, 1, receiver, sample],
+                barycentrics[hit_batch, 1, receiver, sample],
+                fresnel_weights[fresnel_batch, 1, receiver, sample],
+                faces,
+                of_albedo,
+                of_metallic,
+                radiosity,
+                radiosity_batch,
+                texels,
+            )
+        seen = _shine(
+            seen,
+            mean,
+            face,
+            barycentrics[hit_batch, 0, receiver, sample],
+            fresnel_weights[fresnel_batch, 0, receiver, sample],
+            faces,
+            of_albedo,
+            of_metallic,
+            radiosity,
+            radiosity_batch,
+            texels,
+        )
+        blocked = 1.0 - transmittance[instance_in(batch, transmittance.shape[0]), receiver, sample]
+        result = blocked * (seen - mean)
     radiance[batch, receiver, sample] = result
 
 
