@@ -146,8 +146,8 @@ class View(ShadingContext):
 
     @property
     def transfers(self) -> Node:
-        """Transfer vectors of the receivers: :meth:`.Method.cached_transfers`."""
-        return self.method.cached_transfers(self)
+        """Transfer vectors of the receivers: :meth:`.Method.cached_transfer_node`."""
+        return self.method.cached_transfer_node(self)
 
     def image(self, light: LightInput, materials: Materials) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
