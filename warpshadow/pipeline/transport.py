@@ -152,8 +152,8 @@ class LightTransport:
         """Mean radiance of the blockers of receivers on bodies that shine; None where light does not bounce."""
         if not self.method.merged_scene.scene.bounces:
             return None
-        arguments = lobes.all_points, lobes.light, materials
-        bounced, openness = self.shading_without_emitters(*arguments), self._openness(*arguments)
+        bounced = self.shading_without_emitters(lobes.all_points, lobes.light, materials)
+        openness = self._openness(lobes.all_points, lobes.light, materials)
         selected_openness = None if openness is None else lobes.points.select(openness)
         return self.method.lobes.blocked_radiance(lobes, lobes.points.select(bounced), selected_openness)
 
@@ -189,8 +189,8 @@ class LightTransport:
         """
         if self.bounce_solver(points, light, materials) is not BounceSolver.STATIC:
             return None
-        lit = None if light.is_free else self._lit_patch_samples(points, light, materials)
-        return self._static_bounces.openness(points, materials, lit)
+        at_patch_samples = None if light.is_free else self._lit_patch_samples(points, light, materials)
+        return self._static_bounces.openness(points, materials, at_patch_samples)
 
     def _with_emitters(self, light: Node, points: ShadingContext, materials: Materials) -> Node:
         """Add direct light of emitters to other light on points; nothing where no body emits."""
