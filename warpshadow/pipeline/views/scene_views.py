@@ -192,11 +192,11 @@ class SceneViews:
         """
         merged_scene, kinds = self._merged_scene, self._blocker_kinds(geometry)
         vertices, spheres = self._bodies(geometry)
-        distinct = self._receivers.distinct_bodies(kinds)
-        if distinct is not None:
-            distinct = distinct[merged_scene.body_of_face[sides % len(merged_scene.body_of_face)]]
+        span_bodies = self._receivers.span_bodies(kinds)
+        if span_bodies is not None:
+            span_bodies = span_bodies[merged_scene.body_of_face[sides % len(merged_scene.body_of_face)]]
         normals = Node("", vertex_normals, vertices, merged_scene.faces)
-        node = Node("", receivers_on_faces, vertices, normals, merged_scene.faces, sides, barycentrics, distinct)
+        node = Node("", receivers_on_faces, vertices, normals, merged_scene.faces, sides, barycentrics, span_bodies)
         return ShadingContext(
             merged_scene, self._materials, vertices, spheres, node, self.call(), normals=normals, blocker_kinds=kinds
         )
