@@ -395,9 +395,9 @@ class View(ShadingContext):
             reason = f"near = {near:g} cuts all of it away, which is {farthest:g} or less in front of the camera"
         else:
             reason = f"it is outside of the frame, at depths from {nearest:g} to {farthest:g}"
-        which = f"image {number} of {len(face_ids)}" if len(face_ids) > 1 else "the image"
+        image_text = f"image {number} of {len(face_ids)}" if len(face_ids) > 1 else "the image"
         remedy = 'Camera.framing(scene), or framing = "auto" in a scene file, shows all of it'
-        return f"camera: {which} shows nothing of the scene: {reason}; {remedy}"
+        return f"camera: {image_text} shows nothing of the scene: {reason}; {remedy}"
 
 
 def _detach_fragments(fragments: Fragments) -> Fragments:
