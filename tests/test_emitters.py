@@ -464,6 +464,6 @@ def test_receivers_are_lifted_off_planes_once_however_many_lamps_there_are(monke
         renderer.render()
         materials, points = renderer._materials, renderer.view()
         calls.clear()
-        renderer._method.emitted_light(points, materials).value(points.call)
+        renderer._method.emitted_light_node(points, materials).value(points.call)
         counts.append(len(calls))
     assert counts == [2, 2]  # of the receivers of each flat body

@@ -54,7 +54,7 @@ def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np
         np.stack([np.roll(faces[proper], -1, axis=1), np.roll(faces[proper], -2, axis=1)], axis=-1), axis=-1
     )
     first, last = edge_ends.reshape(-1, 2).T
-    lines, owners = first * (faces.max(initial=0) + 1) + last, np.repeat(proper, 3)
+    lines, edge_faces = first * (faces.max(initial=0) + 1) + last, np.repeat(proper, 3)
     permutation = np.argsort(lines)
     is_next = np.zeros(len(lines) + 2, bool)  # of the same edge as the one before
     is_next[1:-2] = lines[permutation[1:]] == lines[permutation[:-1]]
@@ -62,7 +62,7 @@ def edge_neighbors(faces: np.ndarray, positions: np.ndarray | None = None) -> np
     neighbors[permutation[is_next[:-2] | is_next[1:-1]]] = _NOT_MANIFOLD
     pair_starts = np.flatnonzero(~is_next[:-2] & is_next[1:-1] & ~is_next[2:])
     one, other = permutation[pair_starts], permutation[pair_starts + 1]
-    neighbors[one], neighbors[other] = owners[other], owners[one]
+    neighbors[one], neighbors[other] = edge_faces[other], edge_faces[one]
     neighbor[proper] = neighbors.reshape(-1, 3)
     return neighbor
 

@@ -58,9 +58,10 @@ def _hull(points: np.ndarray, corners: np.ndarray) -> ConvexPart:
     largest = np.lexsort((np.linalg.norm(normals, axis=1), face))[np.cumsum(np.bincount(face)) - 1]
     triangle, opposite = np.nonzero(face[:, None] < face[neighbors])
     ends = triangles[triangle[:, None], (opposite[:, None] + [1, 2]) % 3]
-    used = np.unique(triangles)
-    edges = [np.searchsorted(used, ends), face[triangle, None], face[neighbors[triangle, opposite], None]]
-    return ConvexPart(corners[used], np.searchsorted(used, triangles[largest]), np.concatenate(edges, axis=1))
+    corner_ids = np.unique(triangles)
+    edges = [np.searchsorted(corner_ids, ends), face[triangle, None], face[neighbors[triangle, opposite], None]]
+    faces = np.searchsorted(corner_ids, triangles[largest])
+    return ConvexPart(corners[corner_ids], faces, np.concatenate(edges, axis=1))
 
 
 def _is_close(points: np.ndarray, parts: Sequence[ConvexPart]) -> bool:

@@ -119,9 +119,9 @@ def _is_convex(corners: np.ndarray, normal: np.ndarray) -> bool:
 def _without_collinear(points: np.ndarray, outline: list[int], gap: float) -> list[int]:
     """The corners of a polygon without straight ones."""
     for corner in list(outline):
-        at = outline.index(corner)
-        before, after = outline[at - 1], outline[(at + 1) % len(outline)]
+        index = outline.index(corner)
+        before, after = outline[index - 1], outline[(index + 1) % len(outline)]
         side, offset = points[after] - points[before], points[corner] - points[before]
         if len(outline) > 3 and np.linalg.norm(np.cross(side, offset)) <= gap * np.linalg.norm(side):
-            outline = outline[:at] + outline[at + 1 :]
+            outline = outline[:index] + outline[index + 1 :]
     return outline

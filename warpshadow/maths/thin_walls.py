@@ -78,8 +78,9 @@ def find_layer(points: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
     if areas[is_outer].sum() < area / 2:
         is_outer = ~is_outer
     layer = triangles[is_outer]
-    places = points[np.unique(layer)]
-    return layer if np.ptp(places @ principal_axes(places).T, axis=0).min() > MIN_DEPTH * thickness else None
+    layer_points = points[np.unique(layer)]
+    depth = np.ptp(layer_points @ principal_axes(layer_points).T, axis=0).min()
+    return layer if depth > MIN_DEPTH * thickness else None
 
 
 def _opposites(corners: np.ndarray, units: np.ndarray, areas: np.ndarray, thickness: float, reach: float) -> np.ndarray:

@@ -73,11 +73,11 @@ def find_tube(points: np.ndarray, triangles: np.ndarray, maximum: int) -> Tube |
 
 def _lofted(section: np.ndarray, next_section: np.ndarray) -> np.ndarray:
     """Triangles of the loft between two sections, shape [triangle, 3]."""
-    turned, next_turned = np.roll(section, -1), np.roll(next_section, -1)
-    sides = [[section, next_turned, turned], [section, next_section, next_turned]]
+    rolled_section, next_rolled_section = np.roll(section, -1), np.roll(next_section, -1)
+    sides = [[section, next_rolled_section, rolled_section], [section, next_section, next_rolled_section]]
     rest = np.arange(1, len(section) - 1)
     first, last = np.full(len(rest), section[0]), np.full(len(rest), next_section[0])
-    ends = [[first, section[rest], turned[rest]], [last, next_turned[rest], next_section[rest]]]
+    ends = [[first, section[rest], rolled_section[rest]], [last, next_rolled_section[rest], next_section[rest]]]
     return np.concatenate([np.stack(columns, axis=1) for columns in (*sides, *ends)])
 
 
@@ -95,8 +95,8 @@ def _bulge(points: np.ndarray, section: np.ndarray, next_section: np.ndarray, mi
 
 def _swell(radii: np.ndarray, chosen: np.ndarray) -> float:
     """Largest relative deviation of radii [section, corner] from those interpolated between chosen sections."""
-    places = np.arange(len(radii))
-    expected = np.stack([np.interp(places, chosen, column) for column in radii[chosen].T], axis=1)
+    rings = np.arange(len(radii))
+    expected = np.stack([np.interp(rings, chosen, column) for column in radii[chosen].T], axis=1)
     return float(np.abs(radii / expected - 1).max())
 
 
@@ -168,15 +168,15 @@ def _quad_strip(
     leaves it, and whether the strip closes.
     """
     steps = [(quad, side % 4)]
-    seen = {quad}
+    visited = {quad}
     while True:
         quad, side = steps[-1]
         after = quad_at.get((int(corners[quad, (side + 1) % 4]), int(corners[quad, side])))
         if after is None:
             return steps, False
-        if after[0] in seen:
+        if after[0] in visited:
             return steps, after == (steps[0][0], (steps[0][1] + 2) % 4)
-        seen.add(after[0])
+        visited.add(after[0])
         steps.append((after[0], (after[1] + 2) % 4))
 
 

@@ -385,8 +385,8 @@ class SceneRenderer:
         catcher_light = catchers.light(replace(inputs, geometry=alone), view)
         unshadowed = Input("light without the others", catcher_light)
         photo_input = None if photograph is None else Input("photograph", photograph)
-        arguments = photo_input, unshadowed, catchers.has_face, light, materials
-        return view.in_photograph(*arguments).value(self._views.call(view))
+        node = view.in_photograph(photo_input, unshadowed, catchers.has_face, light, materials)
+        return node.value(self._views.call(view))
 
     @property
     def _size(self) -> tuple[int, int]:

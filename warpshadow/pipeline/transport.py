@@ -14,8 +14,8 @@ first two, by light, bounces, reflectance, and where bodies and cameras are:
 | free | some | any | given | moving patches | static patches |
 
 Cameras are the scene's where a call gives none and the renderer has one. The first two rows are
-:meth:`.Method.direct_shading`, the others :func:`choose_bounce_solver`. Static patches cache form factors, so that an
-iteration is small matrices; moving ones find all but cached visibility in each call. A shell is part of the light.
+:meth:`.Method.direct_shading_node`, the others :func:`choose_bounce_solver`. Static patches cache form factors, so that
+an iteration is small matrices; moving ones find all but cached visibility in each call. A shell is part of the light.
 Light of emitters is added here; the radiance that they show, and gloss, in :meth:`.View.image`.
 """
 
@@ -93,7 +93,7 @@ class LightTransport:
     ) -> Node:
         """Light that white points reflect, without direct light of emitters, but with their bounced light."""
         if not self.method.merged_scene.scene.bounces:
-            return self.method.direct_shading(points, light)
+            return self.method.direct_shading_node(points, light)
         materials = materials or points.materials
         bounce = functools.partial(self._bounced, points, light, materials)
         if light.is_free or materials is not points.materials:
@@ -124,9 +124,9 @@ class LightTransport:
         bounce_solver = self.bounce_solver(points, light, materials)
         if bounce_solver is BounceSolver.MOVING:
             return self._moving_bounces.shading(points, light, materials)
-        direct = self.method.direct_shading(points, light)
+        direct = self.method.direct_shading_node(points, light)
         if bounce_solver is BounceSolver.PATHS:
-            return self.method.along_paths(direct, points, light, materials)
+            return self.method.path_shading_node(direct, points, light, materials)
         static = self._static_bounces
         if not light.is_free:
             return static.add_bounces(direct, self._lit_patch_samples(points, light, materials), points, materials)
@@ -137,23 +137,23 @@ class LightTransport:
             )
         samples = static.patch_samples(points, materials)
         if materials.emission:
-            emitted = self.method.light_of_emitters(samples, materials)
+            emitted = self.method.cached_emitted_light_node(samples, materials)
             direct = static.add_bounces(direct, emitted, points, materials)
         return static.add_free_bounces(
-            direct, self.method.cached_transfers(samples, light.shell), light, points, materials
+            direct, self.method.cached_transfer_node(samples, light.shell), light, points, materials
         )
 
     def _lit_patch_samples(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Direct shading of the samples of static patches in known light, vec3 of shape [batch, patch sample]."""
         samples = self._static_bounces.patch_samples(points, materials)
-        return self._with_emitters(self.method.direct_shading(samples, light), samples, materials)
+        return self._with_emitters(self.method.direct_shading_node(samples, light), samples, materials)
 
     def blocked_radiance(self, lobes: LitLobes, materials: Materials) -> Node | None:
         """Mean radiance of the blockers of receivers on bodies that shine; None where light does not bounce."""
         if not self.method.merged_scene.scene.bounces:
             return None
-        arguments = lobes.all_points, lobes.light, materials
-        bounced, openness = self.shading_without_emitters(*arguments), self._openness(*arguments)
+        bounced = self.shading_without_emitters(lobes.all_points, lobes.light, materials)
+        openness = self._openness(lobes.all_points, lobes.light, materials)
         selected_openness = None if openness is None else lobes.points.select(openness)
         return self.method.lobes.blocked_radiance(lobes, lobes.points.select(bounced), selected_openness)
 
@@ -189,14 +189,14 @@ class LightTransport:
         """
         if self.bounce_solver(points, light, materials) is not BounceSolver.STATIC:
             return None
-        lit = None if light.is_free else self._lit_patch_samples(points, light, materials)
-        return self._static_bounces.openness(points, materials, lit)
+        at_patch_samples = None if light.is_free else self._lit_patch_samples(points, light, materials)
+        return self._static_bounces.openness(points, materials, at_patch_samples)
 
     def _with_emitters(self, light: Node, points: ShadingContext, materials: Materials) -> Node:
         """Add direct light of emitters to other light on points; nothing where no body emits."""
         if not materials.emission:
             return light
-        emitted = self.method.light_of_emitters(points, materials)
+        emitted = self.method.cached_emitted_light_node(points, materials)
         return points.cached("light with emitters", (light, emitted), lambda: Node("", add_light, light, emitted))
 
     @functools.cached_property

@@ -97,14 +97,14 @@ def measure(mesh: NormalizedMesh, spheres: np.ndarray, seconds: float) -> FitRep
         is_outside = mesh.signed_distances(points.reshape(-1, 3))[0].reshape(volumes.shape) > 0
         outside_volume = float(volumes[is_outside].sum() / volumes.sum())
     surface, _ = mesh.sample(4000, rng)
-    grown = spheres + [0, 0, 0, 0.01]
+    grown_spheres = spheres + [0, 0, 0, 0.01]
     air, _ = draw_points_around(mesh, NEARBY, rng)
     random_directions = rng.normal(size=air.shape)
     nearby = air, random_directions / np.linalg.norm(random_directions, axis=1, keepdims=True)
     ground_error, shadow_error = _irradiance_errors(mesh, spheres, ground, up_normals)
     return FitReport(
         sphere_count=len(spheres),
-        coverage=float((_count_containing(grown, surface) > 0).mean()),
+        coverage=float((_count_containing(grown_spheres, surface) > 0).mean()),
         outside_volume=outside_volume,
         ground_error=ground_error,
         surface_error=_irradiance_errors(mesh, spheres, *mesh.sample_vertices(SURFACE, rng))[0],

@@ -110,7 +110,7 @@ def _make_project(lanes: int) -> wp.Kernel:
         # out
         axes: wp.array2d(dtype=wp.vec3),
         edges: wp.array2d(dtype=_SphereEdge),
-        reached: wp.array2d(dtype=wp.int32),
+        reached_bundles: wp.array2d(dtype=wp.int32),
     ):
         """A thread owns a block of receivers and a sphere: its direction, its edge, and the bundles that it reaches."""
         row, sphere = wp.tid()
@@ -132,7 +132,7 @@ def _make_project(lanes: int) -> wp.Kernel:
             i = block * lanes + lane
             axes[i, sphere] = wp.vec3(cone.axis.x[lane], cone.axis.y[lane], cone.axis.z[lane])
             edges[i, sphere] = _SphereEdge(low[lane], slope[lane], opacity[lane])  # type: ignore[call-arg]
-            reached[i, sphere] = int(bits[lane])
+            reached_bundles[i, sphere] = int(bits[lane])
 
     return project
 
@@ -203,7 +203,7 @@ def _transmit(
     # in
     axes: wp.array2d[wp.vec3],
     edges: wp.array2d[_SphereEdge],
-    reached: wp.array2d[int],
+    reached_bundles: wp.array2d[int],
     directions: wp.array2d[_Bundle],
     # out
     transmittance: wp.array2d[_Bundle],
@@ -216,7 +216,7 @@ def _transmit(
     z = directions[2, bundle]
     passing = _Bundle(1.0)
     for sphere in range(axes.shape[1]):
-        if (reached[i, sphere] >> bundle) & 1 != 0:
+        if (reached_bundles[i, sphere] >> bundle) & 1 != 0:
             edge = edges[i, sphere]
             axis = edge.slope * axes[i, sphere]
             t = axis[0] * x + axis[1] * y + axis[2] * z - _Bundle(edge.low * edge.slope)
@@ -240,7 +240,7 @@ const float slope = edge.slope;
 const float ux = axis[0] * slope, uy = axis[1] * slope, uz = axis[2] * slope, u0 = edge.low * slope;
 float sum[6][{FIT_BUNDLE}] = {{}};
 for (int bundle = 0; bundle < bundles; ++bundle) {{
-    if (!((reached >> bundle) & 1))
+    if (!((reached_bundles >> bundle) & 1))
         continue;
     const int first = bundle * {FIT_BUNDLE};
     for (int l = 0; l < {FIT_BUNDLE}; ++l) {{
@@ -278,7 +278,7 @@ return sums;
 def _edge_sums(
     axis: wp.vec3,
     edge: _SphereEdge,
-    reached: int,
+    reached_bundles: int,
     directions: wp.array2d[_Bundle],
     upstream: wp.array2d[_Bundle],
     i: int,
@@ -292,7 +292,7 @@ def _transmit_adjoint(
     # in
     axes: wp.array2d[wp.vec3],
     edges: wp.array2d[_SphereEdge],
-    reached: wp.array2d[int],
+    reached_bundles: wp.array2d[int],
     directions: wp.array2d[_Bundle],
     upstream: wp.array2d[_Bundle],
     # out
@@ -302,8 +302,8 @@ def _transmit_adjoint(
     row, sphere = wp.tid()
     i = first_row + row
     gradient = _Sums()
-    if reached[i, sphere] != 0 and edges[i, sphere].opacity > 0.0:
-        gradient = _edge_sums(axes[i, sphere], edges[i, sphere], reached[i, sphere], directions, upstream, i)
+    if reached_bundles[i, sphere] != 0 and edges[i, sphere].opacity > 0.0:
+        gradient = _edge_sums(axes[i, sphere], edges[i, sphere], reached_bundles[i, sphere], directions, upstream, i)
     sums[i, sphere] = gradient
 
 
@@ -314,7 +314,7 @@ class _View(NamedTuple):
     balls: wp.array  # [sphere] vec4
     axes: wp.array  # [receiver, sphere] vec3
     edges: wp.array  # [receiver, sphere] _SphereEdge
-    reached: wp.array  # [receiver, sphere] int32: a bit for each bundle
+    reached_bundles: wp.array  # [receiver, sphere] int32: a bit for each bundle
 
 
 class Adam:
@@ -390,7 +390,7 @@ class Refinement:
         launch(
             _transmit,
             transmittance.shape,
-            inputs=[view.axes, view.edges, view.reached, self.directions],
+            inputs=[view.axes, view.edges, view.reached_bundles, self.directions],
             outputs=[transmittance],
             cost=_PAIR_COST * FIT_BUNDLE * sphere_count,
         )
@@ -418,7 +418,7 @@ class Refinement:
         upstream[: len(receiver_indices)] = adj_transmittance * passing
         adj_logs = wp.array(upstream.reshape(len(upstream), -1, FIT_BUNDLE), dtype=_Bundle, device=self.device)
         sums = empty(view.axes.shape, dtype=_Sums, device=self.device)
-        inputs = [view.axes, view.edges, view.reached, self.directions, adj_logs]
+        inputs = [view.axes, view.edges, view.reached_bundles, self.directions, adj_logs]
         cost = 2 * _PAIR_COST * len(self.receivers.directions)
         launch(_transmit_adjoint, sums.shape, inputs=inputs, outputs=[sums], cost=cost)
         # every block of receivers has a gradient of its own: sums in a fixed order give the same bits on every run

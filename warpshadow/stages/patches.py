@@ -242,7 +242,7 @@ def find_plane_patches(
     piece_mesh = _cut_faces(positions, faces, to_texels)
     labels = grid.texels_of((piece_mesh.centroids - origin) @ frame.T[:, :2])
     centers = origin + grid.middles().reshape(-1, 2) @ frame[:2]
-    is_shown = grid.shown.ravel() == 1
+    is_shown = grid.texel_weights.ravel() == 1
     if half_spaces is not None and not is_shown.all():
         # a piece that reaches out from behind a plane has the light before it
         heights = piece_mesh.pieces.positions(positions, faces) @ half_spaces[:, :3].T + half_spaces[:, 3]

@@ -443,10 +443,10 @@ class TorchRenderer(torch.nn.Module):
         """
         camera = self.cameras[0]
         arguments = Arguments(self.device)
-        slots = (
+        compose = functools.partial(compose_clip_matrices, size=(camera.width, camera.height), near=camera.near)
+        return arguments.apply(
+            compose,
             arguments.add("intrinsics", intrinsics, wp.mat33, ()),
             arguments.add("rotations", rotations, wp.mat33, ()),
             arguments.add("translations", translations, wp.vec3, ()),
         )
-        compose = functools.partial(compose_clip_matrices, size=(camera.width, camera.height), near=camera.near)
-        return arguments.apply(compose, *slots)

@@ -180,7 +180,7 @@ def test_iterations_are_those_of_a_twin_in_float64(given, method, monkeypatch):
     senders = patches.senders(view.materials)
     albedo = patches.albedo(view.materials, senders.bodies).value(view.call).numpy()[0].astype(np.float64)
     (patch_samples,) = (points for name, (_, points) in view._cached.items() if name == "patch samples")
-    transfers = view.method.cached_transfers(patch_samples)
+    transfers = view.method.cached_transfer_node(patch_samples)
     transfer = np.concatenate([each.numpy()[0] for each in transfers.value(view.call)]).astype(np.float64)
 
     def dense(matrix) -> np.ndarray:

@@ -12,7 +12,7 @@ from warpshadow.pipeline.methods.none import NoShadows
 from warpshadow.pipeline.methods.ray_traced import RayTraced, TracedLobes
 from warpshadow.pipeline.shading.lobe_light import LobeVisibility
 from warpshadow.pipeline.shading.method import Method
-from warpshadow.pipeline.shading.sphere_method import SphereMethod
+from warpshadow.pipeline.shading.visibility_steps import VisibilitySteps
 
 
 def table(kind):
@@ -25,7 +25,7 @@ def refuses(function):
     return "raise NotImplementedError" in inspect.getsource(function)
 
 
-@pytest.mark.parametrize(("kind", "row_count"), [(Method, 9), (SphereMethod, 13), (LobeVisibility, 4)])
+@pytest.mark.parametrize(("kind", "row_count"), [(Method, 9), (VisibilitySteps, 13), (LobeVisibility, 4)])
 def test_the_table_of_members_says_which_have_a_default(kind, row_count):
     rows = table(kind)
     defaults = {name: default for names, default in rows for name in names}
@@ -38,7 +38,7 @@ def test_the_table_of_members_says_which_have_a_default(kind, row_count):
 
 @pytest.mark.parametrize("kind", [Directional, LogSH, NoShadows, RayTraced, CellLobes, TracedLobes])
 def test_each_member_that_a_method_overrides_is_in_a_table(kind):
-    bases = (LobeVisibility,) if issubclass(kind, LobeVisibility) else (Method, SphereMethod)
+    bases = (LobeVisibility,) if issubclass(kind, LobeVisibility) else (Method, VisibilitySteps)
     listed = {name for base in bases for names, _ in table(base) for name in names}
     members = {name for base in bases for name, member in vars(base).items() if not isinstance(member, bool)}
     overridden = {name for name in vars(kind) if name in members and not name.startswith("_")} - {"why_no_shadows"}
@@ -52,7 +52,7 @@ def test_each_method_gives_what_is_always_needed(kind):
 
 def test_a_method_that_lacks_a_member_is_refused_when_it_is_made():
     class Half(RayTraced):
-        emitted_light = Method.emitted_light
+        emitted_light_node = Method.emitted_light_node
 
-    with pytest.raises(TypeError, match="emitted_light"):
+    with pytest.raises(TypeError, match="emitted_light_node"):
         Half(None, None)

@@ -31,20 +31,20 @@ def test_points_of_texels_that_a_plane_crosses_lie_before_it(ground):
     texel_size = 2 / 24
     assert moved.any() and (plain_x[moved] > EDGE).all() and (x[moved] < EDGE).all()
     assert (np.abs(x - plain_x) < texel_size / 2).all()
-    np.testing.assert_array_equal(grid.shown.ravel()[covered_points.texels] < 0.5, x > EDGE)
+    np.testing.assert_array_equal(grid.texel_weights.ravel()[covered_points.texels] < 0.5, x > EDGE)
 
 
 def test_planes_that_hide_all_or_nothing_change_no_weight(ground):
     half_spaces = np.array([[0, 1.0, 0, 1.0], [0, 1.0, 0, -1.0], [0, 1.0, 0, 0.0]])  # above, below and in the plane
     grid, _ = find_grid(*ground, is_two_sided=False, half_spaces=half_spaces)
-    assert (grid.shown == 1).all()
+    assert (grid.texel_weights == 1).all()
 
 
 def test_texels_beside_a_plane_have_the_light_before_it(ground):
     grid, _ = find_grid(*ground, is_two_sided=False, half_spaces=np.array([[-1.0, 0, 0, EDGE]]))
     body = PlaneBody(grid, *ground, 0, 0, blocks=True)
     planes = PlaneBlockers.from_bodies([body], grid.covered.size, len(ground[0]), device="cpu")
-    is_before = (grid.shown == 1).ravel()
+    is_before = (grid.texel_weights == 1).ravel()
     entries = planes.texels_of_patches.rows
     starts, columns, weights = (a.numpy() for a in (entries.row_starts, entries.columns, entries.weights))
 

@@ -423,7 +423,7 @@ def test_cells_count_alike_however_few_rays_there_are(count):
     basis = CellBasis(fibonacci(count))
     renderer = SceneRenderer(scene, basis=basis)
     view = renderer.view()
-    (transfer,) = renderer._method.cached_transfers(view).value(view.call)
+    (transfer,) = renderer._method.cached_transfer_node(view).value(view.call)
     cosines = basis.directions[:, 1]
     chosen = cosines > 3 * cell_radius(count)  # not cut by the horizon
     shares = transfer.numpy()[0, 0, chosen] / (4 / count * cosines[chosen])

@@ -29,14 +29,10 @@ from warpshadow.pipeline.bounces.self_form_factors import SelfFormFactors
 from warpshadow.pipeline.node import Call, ExplainRow, Node, identity
 from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
-from warpshadow.pipeline.shading.sphere_method import (
-    LitPortion,
-    ProjectedLight,
-    ShadingNode,
-    SphereMethod,
-    TransferNode,
-)
+from warpshadow.pipeline.shading.sphere_method import SphereMethod
 from warpshadow.pipeline.shading.transfers import join_portions
+from warpshadow.pipeline.shading.visibility_nodes import LitPortion, ShadingNode, TransferNode
+from warpshadow.pipeline.shading.visibility_steps import ProjectedLight
 from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
 from warpshadow.stages.bounces.radiosity import patch_radiosity
@@ -237,7 +233,7 @@ class MovingBounces:
             materials: Of the bodies.
         """
         method, senders = self._method, self._patches.senders(materials)
-        projected_light = method.projected_light(points, light)
+        projected_light = method.projected_light_node(points, light)
         if not senders.bodies:
             direct = ShadingNode(method, points, projected_light, light)
             return Node("bounces", identity, direct, idle="every body is black")
@@ -265,9 +261,9 @@ class MovingBounces:
         arguments = f"{len(senders.sides):,} patch samples", OF_PATCH_SAMPLES
         lit: Node = patch_samples.visibility
         if light.is_free:
-            lit = DirectLightNode(patch_samples.visibility, method.projected_light(points, light), *arguments)
+            lit = DirectLightNode(patch_samples.visibility, method.projected_light_node(points, light), *arguments)
         if materials.emission:
-            lit = Node("", _add_emitted, lit, method.light_of_emitters(patch_samples.points, materials))
+            lit = Node("", _add_emitted, lit, method.cached_emitted_light_node(patch_samples.points, materials))
         albedo = self._patches.albedo(materials, senders.bodies)
         gatherer = self._gatherer(senders, *arguments, why_not, only_others=True)
         return Radiosity(self._count, proxies, self._self_form_factors, gatherer, lit, albedo, patch_samples)
@@ -277,7 +273,7 @@ class MovingBounces:
         return functools.partial(
             TransferNode if light.is_free else ShadingNode,
             self._method,
-            projected_light=self._method.visibility_basis(points, light),
+            projected_light=self._method.visibility_basis_node(points, light),
             light=light,
             result_of=functools.partial(_portion_for_bounces, self._method),
             join=identity,

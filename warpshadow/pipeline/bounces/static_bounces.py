@@ -41,7 +41,7 @@ class StaticBounces:
     """
 
     def __init__(self, method: Method, patches: ScenePatches):
-        self._patches, self._progress, self._openness = patches, method.progress, method.openness
+        self._patches, self._progress, self._openness = patches, method.progress, method.openness_node
         self._bounces = method.merged_scene.scene.bounces  # 1 or more, or "all" until nothing is left
         self._is_still = method.shares_directions
 

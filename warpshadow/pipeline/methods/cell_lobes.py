@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.maths.suns import Suns
-from warpshadow.pipeline.methods.glossy_cells import CellMethod, shading_with_cells, transmittance_of_cells
+from warpshadow.pipeline.methods.glossy_cells import CellMethod, cell_transmittance_node, shading_with_cells_node
 from warpshadow.pipeline.node import Node, field_of
 from warpshadow.pipeline.receivers.shading_context import receiver_text
 from warpshadow.pipeline.shading.lobe_light import LitLobes, LobeVisibility
@@ -38,11 +38,11 @@ class CellLobes(LobeVisibility):
         In known light that does not bounce the shading of the view has found it.
         """
         points, light = lobes.points, lobes.light
-        visibility_light = self._method.visibility_basis(points, light)
+        visibility_light = self._method.visibility_basis_node(points, light)
         if light.is_free or self._merged_scene.scene.bounces:
-            transmittance = transmittance_of_cells(self._method, points, light)
+            transmittance = cell_transmittance_node(self._method, points, light)
         else:
-            transmittance = field_of(shading_with_cells(self._method, lobes.all_points, light), "transmittance")
+            transmittance = field_of(shading_with_cells_node(self._method, lobes.all_points, light), "transmittance")
         return transmittance, points.receivers_node, visibility_light
 
     def transmittance(self, lobes: LitLobes, directions: Node) -> Node:
@@ -76,7 +76,7 @@ class CellLobes(LobeVisibility):
         )
         if projected_light.shell_cells is not None:
             arguments = receivers.points, receivers.normals, transmittance, projected_light.blocking_directions
-            transfer = projected_light.shell_cells.transfer(*arguments)
+            transfer = projected_light.shell_cells.find_transfer(*arguments)
         light = projected_light.coefficients if free is None else change_basis(free, self._method.native_from_basis)
         assert light is not None
         even = wp.full((1, transmittance.shape[2]), wp.vec3(1.0), dtype=wp.vec3, device=diffuse.device)

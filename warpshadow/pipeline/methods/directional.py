@@ -16,7 +16,7 @@ from warpshadow.pipeline.bodies.blockers import BlockerKinds, GroupSpheres
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.methods.cell_lobes import CellLobes
-from warpshadow.pipeline.methods.glossy_cells import shading_with_cells
+from warpshadow.pipeline.methods.glossy_cells import shading_with_cells_node
 from warpshadow.pipeline.methods.sharpest_cells import SharpestCells, find_share_of_sharpest_light, find_sharpest_cells
 from warpshadow.pipeline.node import Input, Node, field_of
 from warpshadow.pipeline.receivers.groups import Group
@@ -236,12 +236,12 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         sun_transmittance = trace_sun_cells(rays[0], group.probe_weights, rays[1], group.body, projected_light.sun)
         return blend_sharp_cells(transmittance_self, sun_transmittance, projected_light.sun.slots)
 
-    def transfer(self, visibility: CellVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
+    def find_transfer(self, visibility: CellVisibility, group: Group, projected_light: ProjectedCells) -> wp.array:
         """Transfer vectors; the transmittance as it is where cached cells hold known light."""
         assert visibility.transmittance_total is not None
         if projected_light.shell_cells is not None:
             arguments = group.points, group.normals, visibility.transmittance_total, projected_light.blocking_directions
-            return projected_light.shell_cells.transfer(*arguments)
+            return projected_light.shell_cells.find_transfer(*arguments)
         if group.cached_rows is None:
             return directional_transfer(
                 visibility.transmittance_total, group.normals, projected_light.cosine_directions
@@ -284,11 +284,11 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         """Visibility in lobes, between cells."""
         return CellLobes(self, self._directions)
 
-    def known_shading(self, points: ShadingContext, light: LightInput) -> Node:
+    def known_shading_node(self, points: ShadingContext, light: LightInput) -> Node:
         """Direct known light on points; where no light bounces, with the cells of bodies that shine."""
         if self.merged_scene.scene.bounces or points.materials.roughness is None:
-            return super().known_shading(points, light)
-        return field_of(shading_with_cells(self, points, light), "shading")
+            return super().known_shading_node(points, light)
+        return field_of(shading_with_cells_node(self, points, light), "shading")
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of the light of each cell that static bodies let through.

@@ -12,23 +12,24 @@ from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.shading.found_visibility import CellVisibility
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells
-from warpshadow.pipeline.shading.sphere_method import LitPortion, ShadingNode, SphereMethod, VisibilityNode
+from warpshadow.pipeline.shading.sphere_method import SphereMethod
 from warpshadow.pipeline.shading.transfers import join_portions, join_rows
+from warpshadow.pipeline.shading.visibility_nodes import LitPortion, ShadingNode, VisibilityNode
 
 CellMethod = SphereMethod[ProjectedCells, CellVisibility]
 
 
-def shading_with_cells(method: CellMethod, points: ShadingContext, light: LightInput) -> Node:
+def shading_with_cells_node(method: CellMethod, points: ShadingContext, light: LightInput) -> Node:
     """Node of the :class:`ShadingAndTransmittance` of points in known light that does not bounce."""
-    join, projected_light = functools.partial(_join_both, method), method.projected_light(points, light)
+    join, projected_light = functools.partial(_join_both, method), method.projected_light_node(points, light)
     arguments = method, points, projected_light, light
     make = functools.partial(ShadingNode, *arguments, result_of=_shading_and_cells, join=join)
     return method.cached_for_light("direct with cells", points, light, make)
 
 
-def transmittance_of_cells(method: CellMethod, points: ShadingContext, light: LightInput) -> Node:
+def cell_transmittance_node(method: CellMethod, points: ShadingContext, light: LightInput) -> Node:
     """Node of the transmittance of points towards cells, float32 of shape [batch, receiver, direction]."""
-    arguments = method, points, method.visibility_basis(points, light), None
+    arguments = method, points, method.visibility_basis_node(points, light), None
     join = functools.partial(_join, method)
     make = functools.partial(VisibilityNode, *arguments, suffix=" of gloss", result_of=_transmittance_of, join=join)
     return points.cached("cells", light.visibility_key, make)

@@ -82,7 +82,7 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
             add_rows(cached_rows, log)
         return HarmonicVisibility(exponential.exponentiate(log, base=self.visibility.base))
 
-    def transfer(self, visibility: HarmonicVisibility, group: Group, projected_light: ProjectedBands) -> wp.array:
+    def find_transfer(self, visibility: HarmonicVisibility, group: Group, projected_light: ProjectedBands) -> wp.array:
         """Transfer vectors, float32 of shape [batch, receiver, bands²]."""
         lobes = self._self_visibility_lobes(visibility, group, projected_light)
         if lobes is None:

@@ -49,11 +49,11 @@ class NoShadows(LogSH):
         """Number of coefficients that take part."""
         return super().coefficient_count(light) if self.shell is None else SHELL_BASIS.size
 
-    def transfer(self, visibility: HarmonicVisibility, group: Group, projected_light: ProjectedBands) -> wp.array:
+    def find_transfer(self, visibility: HarmonicVisibility, group: Group, projected_light: ProjectedBands) -> wp.array:
         """Transfer vectors, float32 of shape [batch, receiver, coefficient]."""
         if projected_light.shell_cells is None:
-            return super().transfer(visibility, group, projected_light)
-        return projected_light.shell_cells.transfer(group.points, group.normals, None, _NO_CELLS)
+            return super().find_transfer(visibility, group, projected_light)
+        return projected_light.shell_cells.find_transfer(group.points, group.normals, None, _NO_CELLS)
 
 
 METHOD = NoShadows

@@ -45,7 +45,7 @@ class RayTraced(Method):
         super().__init__(merged_scene, HarmonicBasis(merged_scene.scene.visibility.order), basis, progress=progress)
         self.shares_directions = self.visibility.sampling == "shared"
 
-    def known_shading(self, points: ShadingContext, light: LightInput) -> Node:
+    def known_shading_node(self, points: ShadingContext, light: LightInput) -> Node:
         """Direct known light on points, towards which rays are drawn."""
         return Node(
             f"shading{points.suffix}",
@@ -58,7 +58,7 @@ class RayTraced(Method):
             rows=(ExplainRow("transfer", idle="rays shade known light at once"),),
         )
 
-    def along_paths(self, direct: Node, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
+    def path_shading_node(self, direct: Node, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Shading of points in known light that bounces along paths, which have no gradient."""
         from warpshadow.pipeline.methods.paths import path_traced
 
@@ -66,12 +66,12 @@ class RayTraced(Method):
         arguments = direct, self._meshes(points), points, light, self.shell_of(light), materials, emitters
         return path_traced(*arguments, samples=self._sample_count, progress=self.progress)
 
-    def emitted_light(self, points: ShadingContext, materials: Materials) -> Node:
+    def emitted_light_node(self, points: ShadingContext, materials: Materials) -> Node:
         """Direct light of emitters on points, by rays to their samples. Differentiable: emission."""
         name = f"light of emitters{points.suffix}"
         return Node(name, self.emitters.traced_light, *self._rays_to_emitters(points, materials))
 
-    def highlights(self, points: ShadingContext, materials: Materials, roughness: Node, cameras: Input) -> Node:
+    def highlights_node(self, points: ShadingContext, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, by rays to their samples."""
         rays = self._rays_to_emitters(points, materials)
         return Node("highlights", self.emitters.traced_highlights, *rays, roughness, cameras)
@@ -111,7 +111,7 @@ class RayTraced(Method):
         """Visibility in lobes, by rays."""
         return TracedLobes(self)
 
-    def transfers(self, points: ShadingContext, shell: Input | None) -> Node:
+    def transfer_node(self, points: ShadingContext, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
         weak_points = points.weak_reference
         node = Node(
@@ -235,7 +235,7 @@ class TracedLobes(LobeVisibility):
     def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
         """Mean radiance of the blockers of receivers, by their light with bounces and without."""
         points = lobes.points
-        direct = self._method.direct_shading(lobes.all_points, lobes.light)
+        direct = self._method.direct_shading_node(lobes.all_points, lobes.light)
         trees = self._method.trees_around(points)
         if openness is None:
             openness = points.cached("openness", None, lambda: Node("", _openness, trees, points.receivers_node))

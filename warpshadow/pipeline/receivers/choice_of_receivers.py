@@ -254,10 +254,10 @@ def face_sizes(
     bodies, counts, lengths = np.empty(0, int), np.empty(0), np.empty(0)
     faces = merged_scene.faces.numpy()
     for face_ids, clip_positions in images:
-        seen, sample_counts = np.unique(face_ids[face_ids >= 0], return_counts=True)
-        bodies = np.concatenate([bodies, merged_scene.body_of_face[seen]])
+        seen_faces, sample_counts = np.unique(face_ids[face_ids >= 0], return_counts=True)
+        bodies = np.concatenate([bodies, merged_scene.body_of_face[seen_faces]])
         counts = np.concatenate([counts, sample_counts * (camera.width * camera.height / face_ids.size)])
-        lengths = np.concatenate([lengths, _longest_edges(clip_positions[faces[seen]], camera)])
+        lengths = np.concatenate([lengths, _longest_edges(clip_positions[faces[seen_faces]], camera)])
     return [_size_of(counts[bodies == body], lengths[bodies == body]) for body in range(len(merged_scene.scene.bodies))]
 
 

@@ -50,8 +50,8 @@ class SceneReceivers:
             self._at_vertices[key] = sides[:, self._merged_scene.body_of_vertex]
         return self._at_vertices[key]
 
-    def distinct_bodies(self, blocker_kinds: BlockerKinds) -> np.ndarray | None:
-        """Number of each distinct body, −1 for others, shape [body]; None where none is distinct."""
+    def span_bodies(self, blocker_kinds: BlockerKinds) -> np.ndarray | None:
+        """Body of the spans of each body's receivers, [body]: itself if it is distinct, else −1; None if none is."""
         bodies = np.arange(len(self._merged_scene.scene.bodies))
         if self._sends_light:
             return bodies
@@ -70,8 +70,8 @@ class SceneReceivers:
         key = frozenset(blocker_kinds.distinct_bodies), blocker_kinds.bulging_bodies, moving
         if key not in self._numberings:
             device = self._merged_scene.device
-            both_sides, distinct_bodies = self.at_vertices(blocker_kinds), self.distinct_bodies(blocker_kinds)
-            bodies = None if distinct_bodies is None else distinct_bodies[self._merged_scene.body_of_vertex]
+            both_sides, span_bodies = self.at_vertices(blocker_kinds), self.span_bodies(blocker_kinds)
+            bodies = None if span_bodies is None else span_bodies[self._merged_scene.body_of_vertex]
             is_static = None if static_bodies is None else static_bodies.has_vertex
             fronts = both_sides[:1]
             if is_static is not None and (both_sides[1] & is_static).any():

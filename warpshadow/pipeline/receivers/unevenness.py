@@ -53,9 +53,9 @@ def light_unevenness(
         Of each of these bodies, shape [body]; 0 where no image shows it.
     """
     device, result = merged_scene.device, np.zeros(len(bodies))
-    eyes = np.concatenate([np.tile(camera.eye, (len(seen), 1)) for camera, seen, _ in images])
-    seen, counts = (np.concatenate([image[item] for image in images]) for item in (1, 2))
-    rows_by_body = [np.flatnonzero(merged_scene.body_of_face[seen] == body) for body in bodies]
+    eyes = np.concatenate([np.tile(camera.eye, (len(seen_faces), 1)) for camera, seen_faces, _ in images])
+    seen_faces, counts = (np.concatenate([image[item] for image in images]) for item in (1, 2))
+    rows_by_body = [np.flatnonzero(merged_scene.body_of_face[seen_faces] == body) for body in bodies]
     chosen = [rows[:: -(-len(rows) // _FACES)] if len(rows) else rows for rows in rows_by_body]
     rows = np.concatenate(chosen)
     if not len(rows) or not (merged_scene.shadow_casters or emitter_luminance):
@@ -64,10 +64,10 @@ def light_unevenness(
     mesh = merged_scene.blocker_mesh(vertices)
     normals = vertex_normals(vertices.reshape((1, -1)), merged_scene.one_rings).numpy()[0]
     faces = merged_scene.faces.numpy()
-    origins, corners = inset_vertices(positions, faces), faces[seen[rows]]
+    origins, corners = inset_vertices(positions, faces), faces[seen_faces[rows]]
     points, point_normals = (_with_middles(values[corners]) for values in (origins, normals))
     is_behind = ((eyes[rows] - points[:, 3]) * point_normals[:, 3]).sum(axis=1) < 0
-    is_behind &= merged_scene.is_two_sided[merged_scene.body_of_face[seen[rows]]]
+    is_behind &= merged_scene.is_two_sided[merged_scene.body_of_face[seen_faces[rows]]]
     lengths = np.linalg.norm(point_normals, axis=2, keepdims=True)
     point_normals *= np.where(is_behind, -1, 1)[:, None, None] / lengths.clip(1e-30)
     received = _irradiance(mesh, points, point_normals, light, device)

@@ -117,8 +117,9 @@ class SceneEmitters:
         merged_scene, beams = self._merged_scene, self.samples.beams
         assert beams is not None
         emitter_of_face = constant(merged_scene.emitter_of_face, wp.int32, merged_scene.device)
-        seen = fragments, merged_scene.faces, vertices, cameras
-        return show_beams(emission, *seen, placed_samples, emitter_of_face, beams.beams)
+        return show_beams(
+            emission, fragments, merged_scene.faces, vertices, cameras, placed_samples, emitter_of_face, beams.beams
+        )
 
     @functools.cached_property
     def self_visibility(self) -> list[EmitterSelfVisibility | None]:
@@ -132,10 +133,10 @@ class SceneEmitters:
         is_convex = len(mesh.convex_parts) == 1 and not is_open
         if merged_scene.is_flat[body] or is_convex or body not in merged_scene.shadow_casters:
             return None
-        samples = weights.vertices @ mesh.positions.astype(np.float64), weights.surface_points
-        surface, device = (mesh.positions, mesh.surface.faces), merged_scene.device
+        positions, faces, device = mesh.positions, mesh.surface.faces, merged_scene.device
+        samples, surface_points = weights.vertices @ positions.astype(np.float64), weights.surface_points
         with unrecorded():
-            return find_self_visibility(*surface, *samples, is_two_sided=is_open, device=device)
+            return find_self_visibility(positions, faces, samples, surface_points, is_two_sided=is_open, device=device)
 
     def direct_luminance(
         self, vertices: wp.array, mesh: wp.Mesh | None, points: np.ndarray, normals: np.ndarray
@@ -151,8 +152,8 @@ class SceneEmitters:
         radiance = self.radiance(Materials.of_scene(merged_scene)).value(Call(Clock()))
         total = np.zeros(len(points))
         for span in samples.spans():
-            sample_arguments = samples, vertices, placed_samples.points[0], placed_samples.areas[0], span
-            traced = trace_transmittance(mesh, point_array[0], normal_array[0], *sample_arguments, rays=1)
+            trace = functools.partial(trace_transmittance, mesh, point_array[0], normal_array[0], samples, vertices)
+            traced = trace(placed_samples.points[0], placed_samples.areas[0], span, rays=1)
             transmittance = weigh_by_beam(point_array, placed_samples, span, traced.reshape((1, *traced.shape)))
             light = sum_light(point_array, normal_array, placed_samples, radiance, span, transmittance)
             total += light.numpy()[0] @ LUMINANCE
@@ -210,10 +211,11 @@ class SceneEmitters:
             mesh = self._merged_scene.scene.bodies[self.samples.bodies[number]].mesh
             counts = [item.vertices.shape[0] for item in self._merged_scene.emitter_sample_weights]
             blocks = [csr_matrix((count, size[0] * size[1])) for count in counts]
-            assert mesh.uvs is not None and mesh.surface.uv_faces is not None
-            texture_space = mesh.positions, mesh.surface.faces, mesh.uvs, mesh.surface.uv_faces
+            faces, uvs, uv_faces = mesh.surface.faces, mesh.uvs, mesh.surface.uv_faces
+            assert uvs is not None and uv_faces is not None
             weights = self._merged_scene.emitter_sample_weights[number]
-            blocks[number] = mean_over_texels(weights.patches, *texture_space, size)[weights.patch_of_samples]
+            means = mean_over_texels(weights.patches, mesh.positions, faces, uvs, uv_faces, size)
+            blocks[number] = means[weights.patch_of_samples]
             matrix = SparseMatrix.from_matrix(vstack(blocks), device=self._merged_scene.device)
             self._texel_matrices[number, size] = matrix
         return self._texel_matrices[number, size]
@@ -222,9 +224,9 @@ class SceneEmitters:
         self, receivers: Receivers, placed_samples: PlacedSamples, radiance: wp.array, transmittance: list[wp.array]
     ) -> wp.array:
         """Their light on receivers, given the transmittance to the samples of each."""
-        lit = receivers.points, receivers.normals, placed_samples, radiance
+        sum_of = functools.partial(sum_light, receivers.points, receivers.normals, placed_samples, radiance)
         pairs = self._within_beams(receivers, placed_samples, transmittance)
-        return add_light(*(sum_light(*lit, *pair) for pair in pairs))
+        return add_light(*(sum_of(span, transmittances) for span, transmittances in pairs))
 
     def traced_highlights(
         self,
@@ -236,9 +238,10 @@ class SceneEmitters:
         clip_matrices: wp.array,
     ) -> LobeLight:
         """Their light in the lobes of receivers, G and G', given transmittance as for :meth:`traced_light`."""
-        seen = receivers.points, receivers.normals, roughness, clip_matrices, placed_samples, radiance
+        points, normals = receivers.points, receivers.normals
         pairs = self._within_beams(receivers, placed_samples, transmittance)
-        emitter_sums = [sum_highlights(*seen, *pair) for pair in pairs]
+        sum_of = functools.partial(sum_highlights, points, normals, roughness, clip_matrices, placed_samples, radiance)
+        emitter_sums = [sum_of(span, transmittances) for span, transmittances in pairs]
         return LobeLight(*(add_light(*parts) for parts in zip(*emitter_sums, strict=True)))
 
     def _within_beams(

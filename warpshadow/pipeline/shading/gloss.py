@@ -101,7 +101,7 @@ def mix_gloss(
         inputs = lobe_light, field_of(samples, "lobes"), suns, sun_transmittance
         lobe_light = Node("suns", add_suns, *inputs, items=item_text)
     if materials.emission:
-        highlights = method.highlights(points, materials, roughness, points.cameras)
+        highlights = method.highlights_node(points, materials, roughness, points.cameras)
         lobe_light = Node("", _add_highlights, lobe_light, highlights)
     light_in_lobes = field_of(lobe_light, "light_f0"), field_of(lobe_light, "light_f90")
     of_surface = field_of(samples, "cosines"), values["metallic"], values["specular"]

@@ -32,18 +32,19 @@ if TYPE_CHECKING:  # they are imported where a body emits, or shines
 class Method(abc.ABC):
     """How light is blocked: a method of visibility.
 
-    A method gives these members. A method by spheres derives from :class:`.SphereMethod`, which gives all but
-    :attr:`lobes` and :meth:`along_paths`, and has a table of its own:
+    A method gives these members; a name that ends with ``_node`` makes a node. A method by spheres derives from
+    :class:`.SphereMethod`, which gives all but :attr:`lobes` and :meth:`path_shading_node`; its own members are in the
+    table of :class:`.VisibilitySteps`.
 
     | member | needed for | default |
     | --- | --- | --- |
-    | :meth:`known_shading` | known light | – |
-    | :meth:`transfers` | free light | – |
-    | :meth:`emitted_light` | lamps | – |
-    | :meth:`highlights` | lamps, on bodies that shine | – |
+    | :meth:`known_shading_node` | known light | – |
+    | :meth:`transfer_node` | free light | – |
+    | :meth:`emitted_light_node` | lamps | – |
+    | :meth:`highlights_node` | lamps, on bodies that shine | – |
     | :attr:`lobes` | bodies that shine | no shadows in mirrored light |
-    | :meth:`openness` | light that bounces between static patches | None: rays find it, as they find form factors |
-    | :meth:`along_paths` | light that bounces along paths (:func:`.choose_bounce_solver`) | refused |
+    | :meth:`openness_node` | light that bounces between static patches | None: rays find it, as form factors |
+    | :meth:`path_shading_node` | light that bounces along paths (:func:`.choose_bounce_solver`) | refused |
     | :meth:`blocker_kinds` | planes, convex parts, traced self-visibility | spheres alone |
     | :meth:`find_squares` | adaptive receivers | None, where every sample receives light |
     | the three fields below | as they say | False |
@@ -104,16 +105,16 @@ class Method(abc.ABC):
 
         return MirroredBodies(self.merged_scene)
 
-    def light_of_emitters(self, points: ShadingContext, materials: Materials) -> Node:
+    def cached_emitted_light_node(self, points: ShadingContext, materials: Materials) -> Node:
         """Direct light of emitters on points, vec3 of shape [batch, receiver], cached for the last emission."""
-        return points.cached("emitted", materials.emission, lambda: self.emitted_light(points, materials))
+        return points.cached("emitted", materials.emission, lambda: self.emitted_light_node(points, materials))
 
     @abc.abstractmethod
-    def emitted_light(self, points: ShadingContext, materials: Materials) -> Node:
+    def emitted_light_node(self, points: ShadingContext, materials: Materials) -> Node:
         """Direct light of emitters on points, past the blockers between, vec3 of shape [batch, receiver]."""
 
     @abc.abstractmethod
-    def highlights(self, points: ShadingContext, materials: Materials, roughness: Node, cameras: Input) -> Node:
+    def highlights_node(self, points: ShadingContext, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, past the blockers between: G and G', vec3 [batch, receiver].
 
         Args:
@@ -164,35 +165,35 @@ class Method(abc.ABC):
         """Center and radius of the sphere that sends light, vec4 of shape [batch]; None for light infinitely far."""
         return self.shell if light.shell is None else light.shell
 
-    def cached_transfers(self, points: ShadingContext, shell: Input | None = None) -> Node:
+    def cached_transfer_node(self, points: ShadingContext, shell: Input | None = None) -> Node:
         """Transfer vectors of points to :attr:`basis`, an array [batch, receiver, coefficient] for each portion.
 
         Args:
             shell: Of the light; None for that of the scene's.
         """
-        return points.cached("transfers", shell, lambda: self.transfers(points, shell))
+        return points.cached("transfers", shell, lambda: self.transfer_node(points, shell))
 
     def cached_for_light(self, name: str, points: ShadingContext, light: LightInput, make: Callable[[], Node]) -> Node:
         """A node of points in known light, cached for the scene's light and for the last other one."""
         name = f"{name} of the scene" if light is self.light else name
         return points.cached(name, light, make)
 
-    def direct_shading(self, points: ShadingContext, light: LightInput) -> Node:
+    def direct_shading_node(self, points: ShadingContext, light: LightInput) -> Node:
         """Direct light that points reflect as white surfaces, without that of emitters, vec3 [batch, receiver].
 
         Known light is shaded at once; free light meets transfer vectors, which are cached.
         """
         if light.is_free:
-            return self._free_shading(points, light)
-        return self.cached_for_light("direct", points, light, lambda: self.known_shading(points, light))
+            return self._free_shading_node(points, light)
+        return self.cached_for_light("direct", points, light, lambda: self.known_shading_node(points, light))
 
     @abc.abstractmethod
-    def known_shading(self, points: ShadingContext, light: LightInput) -> Node:
+    def known_shading_node(self, points: ShadingContext, light: LightInput) -> Node:
         """Direct known light on points."""
 
-    def _free_shading(self, points: ShadingContext, light: LightInput) -> Node:
+    def _free_shading_node(self, points: ShadingContext, light: LightInput) -> Node:
         """Direct free light on points, which is converted where the transfer vectors are not."""
-        transfers = self.cached_transfers(points, light.shell)
+        transfers = self.cached_transfer_node(points, light.shell)
         matrix = self.native_from_basis if transfers.requires_grad else None
         items = functools.partial(receiver_text, points.weak_reference)
         name, shade = f"shading{points.suffix}", functools.partial(shade_free, matrix=matrix)
@@ -207,7 +208,7 @@ class Method(abc.ABC):
         return conversion(basis, native)
 
     @abc.abstractmethod
-    def transfers(self, points: ShadingContext, shell: Input | None) -> Node:
+    def transfer_node(self, points: ShadingContext, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, an array for each portion, for light from a shell."""
 
     @functools.cached_property
@@ -217,10 +218,10 @@ class Method(abc.ABC):
 
         return LobeVisibility(self.merged_scene, self.light, shares_receivers=self.shares_lobes)
 
-    def along_paths(self, direct: Node, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
+    def path_shading_node(self, direct: Node, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Shading of points in known light that bounces along paths, added to direct light."""
         raise NotImplementedError
 
-    def openness(self, points: ShadingContext) -> Node | None:
+    def openness_node(self, points: ShadingContext) -> Node | None:
         """Light that points reflect as white surfaces under an even sky of 1; None where rays find it on average."""
         return None

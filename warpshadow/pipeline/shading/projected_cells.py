@@ -110,7 +110,7 @@ def project_on_cells(
 def _samples(radiance: np.ndarray, of_cells: np.ndarray, cell_directions: np.ndarray) -> np.ndarray:
     """Directions drawn from the light of a map in each cell, [direction, 8, 3]; even ones in a dark cell."""
     numbers = np.arange(len(cell_directions))
-    drawn = draw_in_cells(np.ones_like(radiance), cell_directions, numbers, SAMPLES)
-    lit = np.flatnonzero(of_cells @ LUMINANCE > 0)
-    drawn[lit] = draw_in_cells(radiance, cell_directions, lit, SAMPLES)
-    return drawn
+    samples = draw_in_cells(np.ones_like(radiance), cell_directions, numbers, SAMPLES)
+    lit_cells = np.flatnonzero(of_cells @ LUMINANCE > 0)
+    samples[lit_cells] = draw_in_cells(radiance, cell_directions, lit_cells, SAMPLES)
+    return samples

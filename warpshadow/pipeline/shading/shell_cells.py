@@ -28,7 +28,7 @@ class ShellCells(NamedTuple):
     shell: wp.array  # center and radius, vec4 of shape [batch]
     directions: np.ndarray = SHELL_BASIS.directions  # from the center to their light [cell, 3]
 
-    def transfer(
+    def find_transfer(
         self, points: wp.array, normals: wp.array, transmittance: wp.array | None, cell_directions: np.ndarray
     ) -> wp.array:
         """Transfer vectors of receivers, float32 of shape [batch, receiver, shell cell], given transmittance in cells.

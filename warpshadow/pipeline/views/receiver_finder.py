@@ -47,7 +47,7 @@ class ReceiverFinder:
     ):
         self._method, self._merged_scene, self._scene_receivers = method, method.merged_scene, scene_receivers
         self._blocker_kinds, self._static_bodies = blocker_kinds, static_bodies
-        self._distinct_bodies = scene_receivers.distinct_bodies(blocker_kinds)
+        self._span_bodies = scene_receivers.span_bodies(blocker_kinds)
         self._supersampling = supersampling
         self._may_share_surfaces = method.shares_directions and supersampling <= MAX_SHARED_SAMPLES
 
@@ -94,7 +94,7 @@ class ReceiverFinder:
         shares_surfaces = (
             self._may_share_surfaces and min(fragments.face_ids.shape[1:]) >= _MIN_SHARED_SIZE * self._supersampling
         )
-        body_of_face, distinct_bodies = merged_scene.body_of_face, self._distinct_bodies
+        body_of_face, span_bodies = merged_scene.body_of_face, self._span_bodies
         widens = method.edges_as_wide_as_footprints and self._footprint_widths.any()
         return find_receivers(
             positions,
@@ -103,7 +103,7 @@ class ReceiverFinder:
             fragments,
             numbering,
             gather_of_owners(at_samples, body_of_face),
-            bodies=None if distinct_bodies is None else gather_of_owners(distinct_bodies, body_of_face),
+            bodies=None if span_bodies is None else gather_of_owners(span_bodies, body_of_face),
             supersampling=1 if method.shares_directions and not shares_surfaces else self._supersampling,
             quadtree=quadtree,
             lifts_to_smooth_surface=scene_receivers.at_all_samples,
@@ -125,7 +125,7 @@ class ReceiverFinder:
 
     def _number_seen(self, is_seen: np.ndarray, has_cached_rows: np.ndarray) -> Numbering:
         """Number the vertices that are seen, of bodies with receivers there and of bodies with cached rows."""
-        merged_scene, static_bodies, distinct_bodies = self._merged_scene, self._static_bodies, self._distinct_bodies
+        merged_scene, static_bodies, span_bodies = self._merged_scene, self._static_bodies, self._span_bodies
         keeps_vertex = self._scene_receivers.at_vertices(self._blocker_kinds)[: len(is_seen)] & is_seen
         if has_cached_rows.any():
             keeps_vertex |= gather_of_owners(has_cached_rows, merged_scene.body_of_vertex) & is_seen
@@ -133,7 +133,7 @@ class ReceiverFinder:
             keeps_vertex,
             None if static_bodies is None else static_bodies.has_vertex,
             merged_scene.vertex_order,
-            None if distinct_bodies is None else gather_of_owners(distinct_bodies, merged_scene.body_of_vertex),
+            None if span_bodies is None else gather_of_owners(span_bodies, merged_scene.body_of_vertex),
             device=merged_scene.device,
         )
 

@@ -25,7 +25,7 @@ from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
 from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.transport import LightTransport
-from warpshadow.pipeline.views.view import View
+from warpshadow.pipeline.views.view import View, ViewDependencies
 from warpshadow.pipeline.views.view_warnings import warn_of_view
 from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.raster.project import check_clip_space
@@ -128,9 +128,10 @@ class SceneViews:
             if static_bodies is None or not static_bodies.matches(geometry):
                 static_bodies = StaticBodies(self._merged_scene, geometry)
             note_use(static_bodies)
-        arguments = vertices, spheres, cameras, static_bodies, self._blocker_kinds(geometry, last)
+        blocker_kinds = self._blocker_kinds(geometry, last)
+        dependencies = ViewDependencies(vertices, spheres, cameras, static_bodies, blocker_kinds)
         for view in self.last:
-            if view is not None and view.dependencies == arguments:
+            if view is not None and view.dependencies == dependencies:
                 return view
         if clip_matrices is not None:
             check_clip_space(clip_matrices)
@@ -138,7 +139,7 @@ class SceneViews:
             self._transport,
             self._receivers,
             self._materials,
-            *arguments,
+            dependencies,
             call=self.call(),
             camera=self._cameras[0],
             counts=(len(poses), image_count),
@@ -174,9 +175,9 @@ class SceneViews:
         """
         receivers = Input("receivers", Receivers(points, normals, None, None, None))  # type: ignore[arg-type]
         node = Node("", identity, receivers)
-        bodies, blocker_kinds = self._bodies(geometry), self._method.blocker_kinds(geometry, None)
+        (vertices, spheres), kinds = self._bodies(geometry), self._method.blocker_kinds(geometry, None)
         return ShadingContext(
-            self._merged_scene, self._materials, *bodies, node, self.call(), blocker_kinds=blocker_kinds
+            self._merged_scene, self._materials, vertices, spheres, node, self.call(), blocker_kinds=kinds
         )
 
     def on_faces(self, sides: np.ndarray, barycentrics: np.ndarray, geometry: Geometry | None = None) -> ShadingContext:
@@ -189,14 +190,16 @@ class SceneViews:
             geometry: Where the bodies are, by default where the scene has them.
         Differentiable: geometry.
         """
-        merged_scene, blocker_kinds, bodies = self._merged_scene, self._blocker_kinds(geometry), self._bodies(geometry)
-        distinct = self._receivers.distinct_bodies(blocker_kinds)
-        if distinct is not None:
-            distinct = distinct[merged_scene.body_of_face[sides % len(merged_scene.body_of_face)]]
-        normals = Node("", vertex_normals, bodies[0], merged_scene.faces)
-        node = Node("", receivers_on_faces, bodies[0], normals, merged_scene.faces, sides, barycentrics, distinct)
-        points = merged_scene, self._materials, *bodies, node, self.call()
-        return ShadingContext(*points, normals=normals, blocker_kinds=blocker_kinds)
+        merged_scene, kinds = self._merged_scene, self._blocker_kinds(geometry)
+        vertices, spheres = self._bodies(geometry)
+        span_bodies = self._receivers.span_bodies(kinds)
+        if span_bodies is not None:
+            span_bodies = span_bodies[merged_scene.body_of_face[sides % len(merged_scene.body_of_face)]]
+        normals = Node("", vertex_normals, vertices, merged_scene.faces)
+        node = Node("", receivers_on_faces, vertices, normals, merged_scene.faces, sides, barycentrics, span_bodies)
+        return ShadingContext(
+            merged_scene, self._materials, vertices, spheres, node, self.call(), normals=normals, blocker_kinds=kinds
+        )
 
 
 def camera_batch(cameras: Sequence[Camera]) -> tuple[Camera, ...]:

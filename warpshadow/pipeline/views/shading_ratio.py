@@ -27,7 +27,7 @@ def shading_ratio(view: View, call: Call) -> np.ndarray:
     spheres = Input("spheres", tuple(empty((1, 0), dtype=dtype, device=device) for dtype in (wp.vec3, wp.float32)))
     free = ShadingContext(without_blockers.merged_scene, view.materials, view.vertices, spheres, receivers, call)
     methods_and_points = (view.method, view), (without_blockers, free)
-    shadings = [method.direct_shading(points, method.light) for method, points in methods_and_points]
+    shadings = [method.direct_shading_node(points, method.light) for method, points in methods_and_points]
     images = (view.white_image(shading).value(call) for shading in shadings)
     received, unblocked = (image.numpy()[..., :3].copy() for image in images)
     return np.divide(received, unblocked, out=np.ones_like(received), where=unblocked > 0)

@@ -2,7 +2,7 @@
 
 import functools
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -10,12 +10,12 @@ import warp as wp
 from warpshadow.assets.camera import Camera
 from warpshadow.device.launch import without_gradient
 from warpshadow.pipeline.bodies.blockers import BlockerKinds
+from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.reflectance import Materials, SampleReflectance
 from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached, field_of, identity
 from warpshadow.pipeline.receivers.scene_receivers import SceneReceivers
 from warpshadow.pipeline.receivers.shading_context import ReceiverCount, ShadingContext, receiver_text
 from warpshadow.pipeline.shading.light_input import LightInput
-from warpshadow.pipeline.shading.method import Method
 from warpshadow.pipeline.transport import LightTransport
 from warpshadow.pipeline.views.receiver_finder import ReceiverFinder
 from warpshadow.stages.geometry.normals import vertex_normals
@@ -38,6 +38,16 @@ if TYPE_CHECKING:
     from warpshadow.stages.image.photograph import RatioImage
 
 
+class ViewDependencies(NamedTuple):
+    """All that a view's receivers depend on: it is found again while these are the same."""
+
+    vertices: Input  # positions of all vertices
+    spheres: Input  # centers and radii of the spheres
+    cameras: Input  # clip matrices
+    static_bodies: "StaticBodies | None"
+    blocker_kinds: BlockerKinds
+
+
 class View(ShadingContext):
     """A geometry seen by cameras: all inputs of an image except light and given reflectance.
 
@@ -45,14 +55,11 @@ class View(ShadingContext):
         transport: Light on receivers, by a method of visibility.
         scene_receivers: Where bodies have receivers.
         materials: Reflectance of the scene's bodies.
-        vertices: Positions of all vertices.
-        spheres: Centers and radii of the spheres.
-        cameras: Clip matrices.
-        static_bodies, blocker_kinds, call, is_scene_view: As for :class:`ShadingContext`.
+        dependencies: Bodies and cameras.
+        call, is_scene_view: As for :class:`ShadingContext`.
         camera: Has the cameras' size and near plane.
         counts: Number of geometries, and of images.
     Attributes:
-        dependencies: Vertices, spheres, cameras, static bodies, and how all block light.
         clip_positions, fragments_node, silhouettes, receivers_node: Nodes of the visible surfaces.
     """
 
@@ -61,51 +68,38 @@ class View(ShadingContext):
         transport: LightTransport,
         scene_receivers: SceneReceivers,
         materials: Materials,
-        vertices: Input,
-        spheres: Input,
-        cameras: Input,
-        static_bodies: "StaticBodies | None",
-        blocker_kinds: BlockerKinds,
+        dependencies: ViewDependencies,
         *,
         call: Call,
         camera: Camera,
         counts: tuple[int, int],
         is_scene_view: bool = False,
     ):
-        self.dependencies = vertices, spheres, cameras, static_bodies, blocker_kinds
-        self.transport, self.method = transport, transport.method
-        method = self.method
-        self._scene_receivers = scene_receivers
-        self.cameras = cameras
-        self._camera, self._supersampling, self._pose_count = camera, method.merged_scene.scene.supersampling, counts[0]
+        self.dependencies, self.cameras = dependencies, dependencies.cameras
+        self.transport, self.method, self._scene_receivers = transport, transport.method, scene_receivers
+        merged_scene = self.method.merged_scene
+        self._camera, self._supersampling, self._pose_count = camera, merged_scene.scene.supersampling, counts[0]
         self._size = self._supersampling * camera.width, self._supersampling * camera.height
         self._sample_count = counts[1] * self._size[0] * self._size[1]
         self._sample_text = f"{self._sample_count:,} samples"
-        normals, receivers = self._make_nodes(method, *self.dependencies)
+        normals, receivers = self._make_nodes(merged_scene, dependencies)
         super().__init__(
-            method.merged_scene,
+            merged_scene,
             materials,
-            vertices,
-            spheres,
+            dependencies.vertices,
+            dependencies.spheres,
             receivers,
             call,
-            static_bodies,
-            normals,
-            blocker_kinds,
-            is_scene_view,
+            static_bodies=dependencies.static_bodies,
+            normals=normals,
+            blocker_kinds=dependencies.blocker_kinds,
+            is_scene_view=is_scene_view,
         )
 
-    def _make_nodes(
-        self,
-        method: Method,
-        vertices: Input,
-        spheres: Input,
-        cameras: Input,
-        static_bodies: "StaticBodies | None",
-        blocker_kinds: BlockerKinds,
-    ) -> tuple[Node, Node]:
+    def _make_nodes(self, merged_scene: MergedScene, dependencies: ViewDependencies) -> tuple[Node, Node]:
         """From the vertices to their normals and to the receivers."""
-        merged_scene, samples = method.merged_scene, self._sample_text
+        vertices, spheres, cameras, static_bodies, blocker_kinds = dependencies
+        samples, width, height = self._sample_text, *self._size
         corners = functools.partial(View._vertices, self.weak_reference)
         faces, two_sided = merged_scene.faces, merged_scene.two_sided_faces
         if static_bodies is None or cameras.requires_grad:
@@ -115,7 +109,7 @@ class View(ShadingContext):
             clip = Node(
                 "clip positions", static_bodies.with_moving_clip_positions, vertices, cameras, cached, items=corners
             )
-        fragments = Node("rasterization", rasterize, clip, faces, *self._size, items=samples)
+        fragments = Node("rasterization", rasterize, clip, faces, width, height, items=samples)
         if two_sided.size:
             side_inputs = fragments, faces, two_sided, detached(vertices), detached(cameras)
             sides = Node("sides", find_sides, *side_inputs, items=samples, has_adjoint=False)
@@ -130,13 +124,13 @@ class View(ShadingContext):
         else:
             normals = Node("normals", static_bodies.with_moving_normals, vertices, static_bodies.normals, items=corners)
         # gradients of receivers: at vertices to the vertices alone, at samples to the fragments, too
-        seen = sides if self._scene_receivers.at_samples(blocker_kinds).any() else detached(sides)
+        receiver_fragments = sides if self._scene_receivers.at_samples(blocker_kinds).any() else detached(sides)
         item_text = functools.partial(receiver_text, self.weak_reference)
-        arguments = [vertices, normals, seen, detached(silhouettes), detached(clip)]
+        inputs = [vertices, normals, receiver_fragments, detached(silhouettes), detached(clip)]
         if self._scene_receivers.is_adaptive.any():
-            arguments.append(detached(spheres))
-        finder = ReceiverFinder(method, self._scene_receivers, blocker_kinds, static_bodies, self._supersampling)
-        receivers = Node("receivers", finder.find, *arguments, items=item_text)
+            inputs.append(detached(spheres))
+        finder = ReceiverFinder(self.method, self._scene_receivers, blocker_kinds, static_bodies, self._supersampling)
+        receivers = Node("receivers", finder.find, *inputs, items=item_text)
         self.clip_positions, self.fragments_node, self.silhouettes = clip, sides, silhouettes
         return normals, receivers
 
@@ -146,8 +140,8 @@ class View(ShadingContext):
 
     @property
     def transfers(self) -> Node:
-        """Transfer vectors of the receivers: :meth:`.Method.cached_transfers`."""
-        return self.method.cached_transfers(self)
+        """Transfer vectors of the receivers: :meth:`.Method.cached_transfer_node`."""
+        return self.method.cached_transfer_node(self)
 
     def image(self, light: LightInput, materials: Materials) -> Node:
         """From the receivers to the image: linear RGB and coverage, vec4 of shape [batch, height, width]."""
@@ -156,9 +150,19 @@ class View(ShadingContext):
         shines = materials.roughness or materials.emission
         if not shines and reflectance.pyramids.requires_grad and not (shading.requires_grad or clip.requires_grad):
             replaced_rows = (ExplainRow("reflectance", idle="found with the radiance"),)
-            reflectance_inputs = reflectance.vertex_albedo, reflectance.pyramids, reflectance.footprints
-            arguments = fragments, self.merged_scene.faces, *reflectance_inputs, self._white_radiance_of(shading)
-            samples = Node("radiance", textured_radiance, *arguments, items=item_text, caches=False, rows=replaced_rows)
+            samples = Node(
+                "radiance",
+                textured_radiance,
+                fragments,
+                self.merged_scene.faces,
+                reflectance.vertex_albedo,
+                reflectance.pyramids,
+                reflectance.footprints,
+                self._white_radiance_of(shading),
+                items=item_text,
+                caches=False,
+                rows=replaced_rows,
+            )
         else:
             samples = self._reflected_and_emitted(shading, light, materials, reflectance.samples)
         return self._averaged(samples, is_moving=self._is_moving)
@@ -187,8 +191,8 @@ class View(ShadingContext):
             return self.cached("detached fragments", None, make_node), None
 
         def make_nodes() -> tuple[Node, Node]:
-            seen = detached(self.silhouettes), detached(self.clip_positions)
-            is_near_outline = Node("", find_outline_samples, *seen)
+            silhouettes, clip = detached(self.silhouettes), detached(self.clip_positions)
+            is_near_outline = Node("", find_outline_samples, silhouettes, clip)
             return Node("", detach_near_outlines, self.fragments_node, is_near_outline), is_near_outline
 
         return self.cached("mean slopes", None, make_nodes)
@@ -200,9 +204,8 @@ class View(ShadingContext):
         pyramids = textures.pyramids
         if materials.textures is not self.materials.textures:
             pyramids = textures.pyramids_to(functools.partial(self.coarsest_level, textures.sizes))
-        arguments = fragments, self.clip_positions, pyramids, self._sample_text
-        key, make_nodes = (textures.sizes, fragments), functools.partial(textures.footprints, *arguments)
-        footprints = self.cached("footprints", key, make_nodes)
+        make_nodes = functools.partial(textures.footprints, fragments, self.clip_positions, pyramids, self._sample_text)
+        footprints = self.cached("footprints", (textures.sizes, fragments), make_nodes)
         return materials.reflectance(fragments, pyramids, footprints, self._sample_text)
 
     def coarsest_level(self, sizes: tuple) -> int | None:
@@ -237,20 +240,20 @@ class View(ShadingContext):
     def _emission(self, materials: Materials, fragments: Node) -> Node:
         """Node of the radiance that the samples emit, vec3 of shape [batch, height, width]."""
         textures = materials.textures_of["emission"]
-        seen = fragments, self.merged_scene.faces, materials.of_vertices("emission")
+        faces, of_vertices, pyramids = self.merged_scene.faces, materials.of_vertices("emission"), textures.pyramids
         if not textures.images:
-            return self._dimmed_by_beams(Node("emission", interpolate, *seen))
-        arguments = fragments, self.clip_positions, textures.pyramids, ""
-        make_nodes = functools.partial(textures.footprints, *arguments)
+            return self._dimmed_by_beams(Node("emission", interpolate, fragments, faces, of_vertices))
+        make_nodes = functools.partial(textures.footprints, fragments, self.clip_positions, pyramids, "")
         footprints = self.cached("footprints in emission", (textures.sizes, fragments), make_nodes)
-        return self._dimmed_by_beams(Node("emission", sample_albedo, *seen, textures.pyramids, footprints))
+        emission = Node("emission", sample_albedo, fragments, faces, of_vertices, pyramids, footprints)
+        return self._dimmed_by_beams(emission)
 
     def _dimmed_by_beams(self, emission: Node) -> Node:
         """Node of the part of emission that goes towards the cameras; itself where no emitter has a beam."""
         if not self.merged_scene.has_beams:
             return emission
-        emitters, inputs = self.method.emitters, (self.fragments_node, self.vertices, self.cameras)
-        return Node("beams", emitters.emission_towards_cameras, emission, *inputs, emitters.samples_node(self))
+        show, samples = self.method.emitters.emission_towards_cameras, self.method.emitters.samples_node(self)
+        return Node("beams", show, emission, self.fragments_node, self.vertices, self.cameras, samples)
 
     def _sum_of(self, first: Node, second: Node) -> Node:
         """Node of the samples, of light of two kinds."""
@@ -263,8 +266,8 @@ class View(ShadingContext):
         from warpshadow.pipeline.shading.glossy_points import GlossyPoints
         from warpshadow.pipeline.shading.lobe_light import LitLobes
 
-        arguments = self.cameras, self.fragments_node, self.clip_positions
-        points = self.cached("gloss", None, lambda: GlossyPoints(self, *arguments))
+        make_points = functools.partial(GlossyPoints, self, self.cameras, self.fragments_node, self.clip_positions)
+        points = self.cached("gloss", None, make_points)
         lobes = LitLobes(points, light, self)
         blocked = self.transport.blocked_radiance(lobes, materials)
         radiosity = self.transport.radiosity(self, light, materials)
@@ -298,11 +301,11 @@ class View(ShadingContext):
 
         shading, reflectance = self.shading(light, materials), self._moving_reflectance(materials)
 
-        def divide(fragments: Fragments, *arguments: wp.array) -> "RatioImage":
-            return find_ratio_image(fragments.face_ids, catches, *arguments)
+        def divide(fragments: Fragments, samples: wp.array, catcher_light: wp.array) -> "RatioImage":
+            return find_ratio_image(fragments.face_ids, catches, samples, catcher_light)
 
-        inputs = detached(self.fragments_node), reflectance.samples, unshadowed
-        ratio = Node("ratio", divide, *inputs, items=self._sample_text, caches=False)
+        fragments = detached(self.fragments_node)
+        ratio = Node("ratio", divide, fragments, reflectance.samples, unshadowed, items=self._sample_text, caches=False)
         body_light, inverse_light, base_factor = (
             field_of(ratio, name, caches=False) for name in ("body_light", "inverse_light", "base_factor")
         )
@@ -310,11 +313,11 @@ class View(ShadingContext):
             self._reflected_and_emitted(shading, light, materials, body_light),
             self._radiance(shading, inverse_light),
         )
-        films = [self._averaged(samples, is_moving=self._is_moving) for samples in surfaces]
-        films.append(self._averaged(base_factor))
+        body_film, relit_film = (self._averaged(samples, is_moving=self._is_moving) for samples in surfaces)
+        base_film = self._averaged(base_factor)
         if photograph is None:
-            return Node("photograph", composite_alone, *films, caches=False)
-        return Node("photograph", compose, photograph, *films, caches=False)
+            return Node("photograph", composite_alone, body_film, relit_film, base_film, caches=False)
+        return Node("photograph", compose, photograph, body_film, relit_film, base_film, caches=False)
 
     def white_samples(self, light: LightInput, materials: Materials) -> Node:
         """Light received by the samples, and coverage, vec4 of shape [batch, sample row, sample column].
@@ -392,9 +395,9 @@ class View(ShadingContext):
             reason = f"near = {near:g} cuts all of it away, which is {farthest:g} or less in front of the camera"
         else:
             reason = f"it is outside of the frame, at depths from {nearest:g} to {farthest:g}"
-        which = f"image {number} of {len(face_ids)}" if len(face_ids) > 1 else "the image"
+        image_text = f"image {number} of {len(face_ids)}" if len(face_ids) > 1 else "the image"
         remedy = 'Camera.framing(scene), or framing = "auto" in a scene file, shows all of it'
-        return f"camera: {which} shows nothing of the scene: {reason}; {remedy}"
+        return f"camera: {image_text} shows nothing of the scene: {reason}; {remedy}"
 
 
 def _detach_fragments(fragments: Fragments) -> Fragments:
@@ -415,8 +418,17 @@ def _moving_radiance(
     albedo_has_mean_slope: wp.array | None,
 ) -> tuple[wp.array, wp.array]:
     """Samples, and the colors at edges."""
-    arguments = receivers.fragments, receivers.faces, shading, reflectance, silhouettes, clip_positions
-    return moving_radiance(*arguments, receivers.receiver_of_vertex, receivers.has_mean_slope, albedo_has_mean_slope)
+    return moving_radiance(
+        receivers.fragments,
+        receivers.faces,
+        shading,
+        reflectance,
+        silhouettes,
+        clip_positions,
+        receivers.receiver_of_vertex,
+        receivers.has_mean_slope,
+        albedo_has_mean_slope,
+    )
 
 
 def _sum_moving(first: tuple[wp.array, wp.array], second: tuple[wp.array, wp.array]) -> tuple[wp.array, wp.array]:

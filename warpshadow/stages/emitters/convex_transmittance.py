@@ -334,8 +334,8 @@ def _block_by_compounds_adjoint(
                 if number == end or _may_hide(receiver, part):
                     for i in range(by_parts.shape[1]):
                         blocked_share = wp.min(by_parts[slot, i], by_hull[slot, i])
-                        is_by_part = (number == end) == (by_hull[slot, i] < by_parts[slot, i])
-                        if is_by_part and blocked_share > 0.0 and blocked_share < 1.0 - MIN_TRANSMITTANCE:
+                        decides = (number == end) == (by_hull[slot, i] < by_parts[slot, i])
+                        if decides and blocked_share > 0.0 and blocked_share < 1.0 - MIN_TRANSMITTANCE:
                             beam = _find_beam(receiver, i)
                             adj_share = -adj_log_transmittances[batch, index, i] / (1.0 - blocked_share)
                             adj = _blocked_share_adjoint(receiver.parts, part, beam, adj_share, part_batch, adj_corners)

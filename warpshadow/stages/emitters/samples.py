@@ -88,7 +88,7 @@ def find_sample_weights(
     corners = pieces.positions(positions, faces)
     piece_vectors = area_normals(corners) / 2
     is_used = labels >= 0
-    labels, owners, vectors = labels[is_used], pieces.faces[is_used], piece_vectors[is_used]
+    labels, piece_faces, vectors = labels[is_used], pieces.faces[is_used], piece_vectors[is_used]
     areas, patch_count = np.linalg.norm(vectors, axis=1), int(labels.max(initial=-1)) + 1
     piece_shares = np.abs(np.linalg.det(pieces.corners[is_used].astype(np.float64)))
     sums = np.zeros((patch_count, 4))
@@ -96,28 +96,28 @@ def find_sample_weights(
     stretch = np.minimum(sums[:, 3] / np.maximum(np.linalg.norm(sums[:, :3], axis=1), 1e-30), _MAX_STRETCH)
     middles = (areas / sums[labels, 3])[:, None] * pieces.corners[is_used].mean(axis=1)
     of_vertices = csr_matrix(
-        (middles.ravel(), (np.repeat(labels, 3), faces[owners].ravel())), shape=(patch_count, len(positions))
+        (middles.ravel(), (np.repeat(labels, 3), faces[piece_faces].ravel())), shape=(patch_count, len(positions))
     )
     softness = np.sqrt(3 * np.maximum(stretch - 1, 0))
     softness[softness > _MAX_SOFTNESS] = 0
     of_faces = diags(stretch / (1 + softness**2 / 3)) @ csr_matrix(
-        (piece_shares, (labels, owners)), shape=(patch_count, len(faces))
+        (piece_shares, (labels, piece_faces)), shape=(patch_count, len(faces))
     )
     permutation = compact_order(of_vertices @ positions.astype(np.float64), runs=(SAMPLE_BUNDLE,))
     padding = np.full(-patch_count % SAMPLE_BUNDLE, permutation[-1] if patch_count else 0)
     is_real = np.repeat([1.0, 0.0], [patch_count, len(padding)])
     chosen = np.concatenate([permutation, padding]).astype(int)
     permutation_of_pieces, first_pieces = _pieces_of_samples(labels, chosen)
-    owners_of_corners = faces[owners[permutation_of_pieces]]
+    piece_vertices = faces[piece_faces[permutation_of_pieces]]
     of_corners = csr_matrix(
         (
             pieces.corners[is_used][permutation_of_pieces].ravel(),
-            np.repeat(owners_of_corners[:, None], 3, axis=1).ravel(),
+            np.repeat(piece_vertices[:, None], 3, axis=1).ravel(),
             np.arange(0, 9 * len(permutation_of_pieces) + 1, 3),
         ),
         shape=(3 * len(permutation_of_pieces), len(positions)),
     )
-    surface_points = _find_surface_points(owners, pieces.corners[is_used], corners[is_used], labels, areas)
+    surface_points = _find_surface_points(piece_faces, pieces.corners[is_used], corners[is_used], labels, areas)
     return SampleWeights(
         of_vertices[chosen].tocsr(),
         (diags(is_real) @ of_faces[chosen]).tocsr(),
@@ -330,10 +330,10 @@ def facing_area(beam: wp.vec3, area: wp.vec3, softness: float, is_two_sided: int
     """Area of a sample that a receiver sees, times the length of the way to it: that of its front, or of both sides."""
     facing = -wp.dot(beam, area)
     width = softness * wp.length(area) * wp.length(beam)
-    seen = _soft_positive(facing, width)
+    area_seen = _soft_positive(facing, width)
     if is_two_sided == 1:
-        seen = seen + _soft_positive(-facing, width)
-    return seen
+        area_seen = area_seen + _soft_positive(-facing, width)
+    return area_seen
 
 
 @wp.func

@@ -35,7 +35,7 @@ def _show_beams(
     beams: wp.array(dtype=wp.vec2),
     run: int,
     # out
-    shown: wp.array2d(dtype=wp.vec3),
+    shown_emission: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a run of samples of an instance."""
     row, column = wp.tid()
@@ -52,9 +52,9 @@ def _show_beams(
         if emitter >= 0:
             point = interpolate_at(positions[body_batch], faces[face], barycentrics[fragment_batch, sample])
             axis = wp.normalize(axes[instance_in(batch, axes.shape[0]), emitter])
-            shown[batch, sample] = spot_falloff(axis, eye - point, beams[emitter]) * radiance
+            shown_emission[batch, sample] = spot_falloff(axis, eye - point, beams[emitter]) * radiance
         else:
-            shown[batch, sample] = radiance
+            shown_emission[batch, sample] = radiance
 
 
 def show_beams(
@@ -84,7 +84,7 @@ def show_beams(
     arrays = {"emission": emission, "fragments": fragments.face_ids, "geometry": positions, "cameras": clip_matrices}
     count, device = common_batch(arrays | {"emitters": samples.axes}), emission.device
     run = run_length(device, width)
-    shown = empty((count, height * width), dtype=wp.vec3, device=device)
+    shown_emission = empty((count, height * width), dtype=wp.vec3, device=device)
     launch(
         _show_beams,
         run_dimensions(device, height * width // run, count),
@@ -92,8 +92,8 @@ def show_beams(
             *(rows(emission), *fragments.rows, faces, positions, clip_matrices, samples.axes),
             *(emitter_of_face, constant(beams, wp.vec2, device), run),
         ],
-        outputs=[shown],
+        outputs=[shown_emission],
         shared=[positions, clip_matrices, samples.axes],
         cost=_COST * run,
     )
-    return reshaped(shown, (count, height, width))
+    return reshaped(shown_emission, (count, height, width))

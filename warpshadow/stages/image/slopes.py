@@ -143,7 +143,7 @@ def _measure_steps(
     """Steps of a sample to its neighbors, or to the edges before these."""
     steps = _ColorSteps(wp.vec2(), wp.vec4(), wp.vec2(), wp.vec2(1.0, 1.0))  # type: ignore[call-arg]
     for direction in range(4):
-        axis = direction / 2
+        axis = direction // 2
         sign = direction_sign(direction)
         distance = distance_to_end(surfaces, fragment, direction)
         other = neighbor(sample, direction, surfaces.fragments.width)
@@ -171,7 +171,7 @@ def _follow_edges(
 ):
     """Add the gradients of the ends of the edges beside a sample, by its steps to them."""
     for direction in range(4):
-        axis = direction / 2
+        axis = direction // 2
         if steps.to_edges[direction] != 0.0:
             slope = steps.to_edges[direction] / steps.lengths[axis] * (steps.extents[axis] / image_weight)
             edge = edges[direction]

@@ -37,7 +37,7 @@ class PlaneTexture(NamedTuple):
     high: np.ndarray  # corners of the rectangle in (ξ, η), float64 of shape [2]
     covered: np.ndarray  # share of each texel that the mesh covers, float32 of shape [row, column]
     sides: int  # 1 if the front alone sends light, 2 if the back does, too; its patches follow the front's
-    shown: np.ndarray  # weight of each texel, 1 unless another plane hides it, float32 of shape [row, column]
+    texel_weights: np.ndarray  # weight of each texel, 1 unless another plane hides it, float32 of shape [row, column]
     outline: np.ndarray  # edges (a, b) around the mesh and its holes, the mesh to their left, float64 [edge, 2, 2]
 
     @property
@@ -205,27 +205,27 @@ def _with_covered(
     row = test_starts[faces, 1] + point_indices // counts[faces, 0]
     barycentrics = _barycentrics(corners[faces], points[row, column])
     is_inside = (barycentrics > -_ROUNDING).all(axis=1)
-    owners = np.full(points.shape[:2], -1)
-    owners[row[is_inside], column[is_inside]] = np.flatnonzero(is_inside)
+    pieces_of_points = np.full(points.shape[:2], -1)
+    pieces_of_points[row[is_inside], column[is_inside]] = np.flatnonzero(is_inside)
 
     def by_texel(values: np.ndarray) -> np.ndarray:
         """Values of the points of each texel, [texel, point]."""
         parted = values.reshape(height, _TESTS_PER_SIDE, width, _TESTS_PER_SIDE)
         return parted.swapaxes(1, 2).reshape(height * width, -1)
 
-    owners_of_texels = by_texel(owners)
+    pieces_of_texels = by_texel(pieces_of_points)
     hidden_counts = by_texel(_count_hiding(grid, points, half_spaces))
     off_centers = np.abs(np.arange(_TESTS_PER_SIDE**2) - _TESTS_PER_SIDE**2 // 2)
-    ranks = np.where(owners_of_texels >= 0, hidden_counts * _TESTS_PER_SIDE**2 + off_centers, np.iinfo(int).max)
+    ranks = np.where(pieces_of_texels >= 0, hidden_counts * _TESTS_PER_SIDE**2 + off_centers, np.iinfo(int).max)
     chosen = np.arange(len(ranks)), ranks.argmin(axis=1)
-    chosen_owners, chosen_counts = owners_of_texels[chosen], hidden_counts[chosen]
-    texels = np.flatnonzero(chosen_owners >= 0)
+    chosen_pieces, chosen_counts = pieces_of_texels[chosen], hidden_counts[chosen]
+    texels = np.flatnonzero(chosen_pieces >= 0)
     min_count = chosen_counts[texels].min(initial=chosen_counts.max())
-    shown = np.float32(_HIDDEN_WEIGHT) ** np.minimum(chosen_counts - min_count, _MAX_HIDING)
-    covered = (owners_of_texels >= 0).mean(axis=1).astype(np.float32)
-    grid = grid._replace(covered=covered.reshape(height, width), shown=shown.reshape(height, width))
-    chosen_barycentrics = np.maximum(barycentrics[chosen_owners[texels]], 0)
-    return grid, CoveredPoints(faces[chosen_owners[texels]], chosen_barycentrics, texels)
+    texel_weights = np.float32(_HIDDEN_WEIGHT) ** np.minimum(chosen_counts - min_count, _MAX_HIDING)
+    covered = (pieces_of_texels >= 0).mean(axis=1).astype(np.float32)
+    grid = grid._replace(covered=covered.reshape(height, width), texel_weights=texel_weights.reshape(height, width))
+    chosen_barycentrics = np.maximum(barycentrics[chosen_pieces[texels]], 0)
+    return grid, CoveredPoints(faces[chosen_pieces[texels]], chosen_barycentrics, texels)
 
 
 def _count_hiding(grid: PlaneTexture, points: np.ndarray, half_spaces: np.ndarray) -> np.ndarray:

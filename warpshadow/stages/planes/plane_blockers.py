@@ -102,7 +102,7 @@ class PlaneBlockers:
             grid, first_level, first_edge = body.grid, len(levels), sum(map(len, edges))
             is_exact = len(grid.outline) <= MAX_EDGES
             edges.append((grid.outline if is_exact else grid.rectangle()).reshape(-1, 4))
-            matrices, weights = _halvings(*grid.covered.shape), grid.covered * grid.shown
+            matrices, weights = _halvings(*grid.covered.shape), grid.covered * grid.texel_weights
             for side in range(grid.sides):
                 for matrix, level_matrix, (height, width) in matrices:
                     levels.append((texel_count, width, height))

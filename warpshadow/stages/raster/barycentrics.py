@@ -90,7 +90,7 @@ def _find_barycentrics(
     instance, thread = split_row(first_row + wp.tid(), face_ids.shape[1] // run)
     clip = clip_positions[instance]
     height = face_ids.shape[1] // width
-    row = thread * run / width
+    row = thread * run // width
     for sample in range(thread * run, (thread + 1) * run):
         face = face_ids[instance, sample]
         if face >= 0:

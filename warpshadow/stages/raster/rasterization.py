@@ -343,8 +343,8 @@ def _rasterize_faces(
     layer_index = first_row + row_of_layer
     instance, layer = split_row(layer_index, layer_count)
     face_count = faces.shape[0]
-    face_id = layer * face_count / layer_count + face_in_layer
-    if face_id >= (layer + 1) * face_count / layer_count:
+    face_id = layer * face_count // layer_count + face_in_layer
+    if face_id >= (layer + 1) * face_count // layer_count:
         return
     vertices = faces[face_id]
     if wp.min(vertices) < 0 or wp.max(vertices) >= corners.shape[1]:

@@ -11,7 +11,7 @@ stages that locate points in an image agree on this:
     line          ℓ with ℓ·(x, y, 1) = 0; a × b is the line through vertices a and b
     plane         n with n·(x, y, w) = 1; relative to a ray, n_w is the 1/w at which the ray meets it
     direction     from a sample's center to that of a neighbor: 0 right, 1 left, 2 below, 3 above
-    axis          direction / 2, of a direction: 0 is x, 1 is y
+    axis          direction // 2, of a direction: 0 is x, 1 is y
     distance      from a sample's center along a direction, 1 at the neighbor's center [samples]
 """
 
@@ -31,7 +31,7 @@ def center(column: int, row: int, width: int, height: int):
 @wp.func
 def sample_center(sample: int, width: int, height: int):
     """Position of the center of a sample of flat images."""
-    row = sample / width
+    row = sample // width
     return center(sample - row * width, row % height, width, height)
 
 
@@ -51,7 +51,7 @@ def neighbor(sample: int, direction: int, width: int):
 @wp.func
 def has_neighbor(sample: int, direction: int, width: int, height: int):
     """Whether a sample has a neighbor in a direction."""
-    row = sample / width
+    row = sample // width
     place = wp.where(direction < 2, sample - row * width, row % height)
     last = wp.where(direction < 2, width, height) - 1
     return wp.where(direction % 2 == 0, place < last, place > 0)
@@ -149,18 +149,18 @@ def face_plane(corners: wp.vec3i, position: wp.vec2, clip_positions: wp.array(dt
 @wp.func
 def line_distance(line: wp.vec3, direction: int, half: wp.vec2):
     """Distance at which a line, relative to a sample's center, crosses a direction; ``half`` is `half_size`."""
-    axis = direction / 2
+    axis = direction // 2
     return -direction_sign(direction) * half[axis] * line[2] / line[axis]
 
 
 @wp.func
 def line_slope(line: wp.vec3, direction: int, half: wp.vec2):
     """Slope of a line: by how much it moves along a direction from one row (or column) to the next [samples]."""
-    axis = direction / 2
+    axis = direction // 2
     return wp.abs(line[1 - axis] / line[axis]) * half[axis] / half[1 - axis]
 
 
 @wp.func
 def ends_before(line: wp.vec3, direction: int):
     """Whether a line, positive on the surface that ends there, bounds the surface of the sample, not its neighbor."""
-    return -direction_sign(direction) * line[direction / 2] > 0.0
+    return -direction_sign(direction) * line[direction // 2] > 0.0

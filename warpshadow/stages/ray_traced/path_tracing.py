@@ -322,8 +322,9 @@ def _bright_sides(
         cost=2 * RAY_COST * point_count,
     )
     sides = np.arange(2 * face_count).reshape(2, -1)
-    lit = reflected.numpy(), sides, corners.astype(np.float64)
-    bright = find_bright_patches(*lit, rays=1, min_share=_MIN_BRIGHT_SHARE, device=device)
+    bright = find_bright_patches(
+        reflected.numpy(), sides, corners.astype(np.float64), rays=1, min_share=_MIN_BRIGHT_SHARE, device=device
+    )
     return bright, wp.array(corners.reshape(-1, 3), dtype=wp.vec3, device=device)
 
 

@@ -83,7 +83,7 @@ def measure_area(fragments: FragmentArrays, sample: int, direction: int, edge: w
         distance = wp.clamp(line_distance(line, direction, samples_per_unit), 0.0, 1.0)
         slope = line_slope(line, direction, samples_per_unit)
         area = _area_beyond(distance, wp.min(slope, 1.0))
-        if wp.isfinite(line / line[direction / 2]):  # else vertices are so far away that products overflow
+        if wp.isfinite(line / line[direction // 2]):  # else vertices are so far away that products overflow
             is_surface_end = edge[0] == neighbor_edge[0] and edge[1] == neighbor_edge[1]
             line_area.area = area
             line_area.weight = 1.0 / (1.0 + slope * slope * slope * slope)
@@ -101,7 +101,7 @@ def measure_area_adjoint(
     adj_clip_positions: wp.array2d(dtype=wp.vec4),
 ):
     """The adjoint of `measure_area` by the area: it adds to the gradients of the line's vertices."""
-    axis = direction / 2
+    axis = direction // 2
     batch = image_index(fragments, sample)
     clip = fragments.clip_positions[batch]
     samples_per_unit = half_size(fragments.width, fragments.height)

@@ -66,8 +66,8 @@ def _find_edge_colors(
                     receiver_a = receivers[join_side(edge[0], is_back, clip.shape[0])]
                     receiver_b = receivers[join_side(edge[1], is_back, clip.shape[0])]
                     if wp.min(receiver_a, receiver_b) >= 0:
-                        offset_a = relative_to_ray(clip[edge[0]], center)[1 - direction / 2]
-                        offset_b = relative_to_ray(clip[edge[1]], center)[1 - direction / 2]
+                        offset_a = relative_to_ray(clip[edge[0]], center)[1 - direction // 2]
+                        offset_b = relative_to_ray(clip[edge[1]], center)[1 - direction // 2]
                         edge_position = wp.clamp(offset_a / (offset_a - offset_b), 0.0, 1.0)
                         edge_radiance = wp.lerp(
                             receiver_shading[receiver_a], receiver_shading[receiver_b], edge_position

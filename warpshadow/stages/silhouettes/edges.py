@@ -137,7 +137,7 @@ def find_half_edge(
             goal_face = wp.where(starts_at_sample, neighbor_face, face)
             end_position = wp.where(starts_at_sample, neighbor_position + margin, sample_position - margin)
             half_edge, crease = _find_surface_end(
-                start_face, goal_face, end_position, direction / 2, fragments.faces, neighbors, creases, clip
+                start_face, goal_face, end_position, direction // 2, fragments.faces, neighbors, creases, clip
             )
     return wp.where(half_edge >= 0, half_edge, crease)
 
@@ -164,10 +164,10 @@ def edge_of_crossing(
     is_seen_by_neighbor: bool,
 ):
     """Vertices of the edge between a sample and its neighbor, as the sample or the neighbor has them."""
-    crossing = crossings[direction / 2, sample]
+    crossing = crossings[direction // 2, sample]
     if crossing < 0:
         return wp.vec2i(crossing, crossing)  # nothing, or where faces intersect
-    face = crossing / 3
+    face = crossing // 3
     corner = crossing - 3 * face
     clip = fragments.clip_positions[image_index(fragments, sample)]
     edge = oriented_edge(face, corner, fragments.faces, clip)

@@ -171,7 +171,7 @@ def _find_edges(
 @wp.func
 def _intersects_between(fragments: FragmentArrays, sample: int, direction: int):
     """Whether the faces of a sample and its neighbor intersect between them, by more than rounding."""
-    axis = direction / 2
+    axis = direction // 2
     clip = fragments.clip_positions[image_index(fragments, sample)]
     line = line_between(fragments, sample, direction, wp.vec2i(INTERSECTION, INTERSECTION))
     center = sample_center(sample, fragments.width, fragments.height)
@@ -288,7 +288,7 @@ def _make_entries(
                 is_before = direction % 2 == 0  # crossings are of the sample before
                 crossing_sample = wp.where(is_before, sample, neighbor(sample, direction, fragments.width))
                 if entry_number >= 0 and crossing_sample >= 0:
-                    axis = direction / 2
+                    axis = direction // 2
                     edge = edge_of_crossing(
                         fragments, neighbors, creases, crossings, crossing_sample, 2 * axis, not is_before
                     )

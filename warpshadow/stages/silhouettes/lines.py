@@ -46,7 +46,7 @@ def make_fragment_arrays(fragments: Fragments, faces: wp.array, clip_positions: 
 @wp.func
 def image_index(fragments: FragmentArrays, sample: int):
     """Index of the image that a sample of flat images belongs to."""
-    return sample / (fragments.width * fragments.height)
+    return sample // (fragments.width * fragments.height)
 
 
 @wp.func
