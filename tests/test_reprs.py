@@ -12,6 +12,7 @@ def test_objects_say_in_a_line_what_they_are():
     light = ws.EnvironmentMap.constant(1.0, 4)
     camera = ws.Camera.look_at((0, 1, 4), (0, 1, 0), fov_y=30, size=(8, 6))
     scene = ws.Scene([body, ground], light, camera, ws.Visibility("none"))
+    tensors = TorchRenderer(scene)
     shown = {
         "Mesh('icosphere', 42 vertices, 80 faces)": mesh,
         "Body('ball', 42 vertices, 80 faces, 1 spheres)": body,
@@ -20,6 +21,10 @@ def test_objects_say_in_a_line_what_they_are():
         "Camera(8 × 6, eye (0, 1, 4), fov_y 30)": camera,
         f"Scene([{body}, {ground}], {light}, {camera}, 'none')": scene,
         f"Renderer({scene}, cpu)": ws.Renderer(scene),
+        "Layers(8 × 6, 2 bodies)": ws.Renderer(scene).layers(),
+        "LayerTensors(8 × 6, 2 bodies)": tensors.layers(),
+        "CellBasis(16 cells)": ws.CellBasis(ws.fibonacci(16)),
+        "Target(8 × 6, a mask)": inverse.Target(ws.render(scene), mask=[[1.0] * 8] * 6),
     }
     for text, value in shown.items():
         assert repr(value) == text

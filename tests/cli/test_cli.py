@@ -1,5 +1,6 @@
 """The command line: what it writes, what it prints, and one clear line for each mistake."""
 
+import csv
 import dataclasses
 import errno
 import functools
@@ -21,6 +22,7 @@ from warpshadow.assets.image import exr_bytes
 from warpshadow.cli import app
 from warpshadow.maths import sh
 from warpshadow.pipeline.receivers.choice_of_receivers import for_still
+from warpshadow.scene import toml_tables
 from warpshadow.scene.visibility import METHODS
 
 PROGRAM = [sys.executable, "-c", "from warpshadow.cli import app; app(prog_name='warpshadow')"]
@@ -453,6 +455,10 @@ def test_an_unknown_device_names_the_known_ones(scene, tmp_path, command, name):
         (("render", "scene.toml", "-o", "x.exr", "--colour", "red"), "--colour"),
         (("render", "cow.obj", "-o", "x.exr", "--width", "200"), "No such option: --width (write --size WIDTH HEIGHT)"),
         (("tune", "cow.obj", "--height=200"), "No such option: --height (write --size WIDTH HEIGHT)"),
+        (
+            ("render", "s.toml", "-o", "x.exr", "--spp", "64"),
+            "No such option: --spp (write --samples COUNT, of --method",
+        ),
         (("render", "scene.toml", "-o", "x.exr", "--bounces", "2.5"), "got '2.5', expected a whole number"),
         (("render", "scene.toml", "-o", "x.exr", "--bounces", "-1"), "got -1, expected a whole number from 0"),
         (("tune", "scene.toml", "--error", "0.1", "--bounces", "17"), "17, expected a whole number from 0 to 16"),
@@ -733,6 +739,27 @@ def test_a_fit_that_diverges_is_status_3_and_keeps_what_it_had(fit_file, tmp_pat
         assert last.startswith("error: ") and last.endswith(f"{tmp_path / 'out'} has the best values before that")
     assert np.isfinite(found(tmp_path / "out").light).all()
     assert (tmp_path / "out" / "after.png").exists()
+
+
+def test_a_fit_that_does_not_explain_its_images_is_status_4_and_its_summary_says_so(fit_file, tmp_path):
+    """The image is three times as bright; another fit, of the right one, is explained."""
+    ws.write_image(tmp_path / "bright.exr", 3 * ws.read_image(tmp_path / "photo.exr"))
+    (tmp_path / "bright.toml").write_text(FIT.replace("photo", "bright").replace("iterations = 60", "iterations = 2"))
+    (tmp_path / "right.toml").write_text(FIT.replace("iterations = 60", "iterations = 30"))
+    folder = tmp_path / "bright"
+    for _ in range(2):  # when it is run again, too
+        result = run("fit", tmp_path / "bright.toml", "-o", folder)
+        assert result.exit_code == 4, result.output
+        last = result.stderr.strip().splitlines()[-1]
+        assert last.startswith(f"error: {folder} does not explain its images: images are off by ")
+    verdict = toml_tables.read(folder / "summary.toml", "summary")["verdict"]
+    assert verdict["is_explained"] is False and verdict["image_error"] > 0.5
+    result = run("fit", tmp_path / "right.toml", tmp_path / "bright.toml", "-o", tmp_path / "both", "--workers", 1)
+    assert result.exit_code == 4 and "error: bright does not explain its images: images are off by" in result.stderr
+    assert result.stdout.strip().endswith("; 1 of them do not explain their images")
+    with (tmp_path / "both" / "table.csv").open() as table:
+        assert [bool(row["doubt"]) for row in csv.DictReader(table)] == [False, True]
+    assert toml_tables.read(tmp_path / "both" / "right" / "summary.toml", "summary")["verdict"]["is_explained"]
 
 
 def test_a_fit_writes_only_into_a_folder_of_its_own(fit_file, tmp_path):

@@ -23,8 +23,9 @@ from warpshadow.inverse import (
     Texture,
     fit,
 )
-from warpshadow.inverse.diagnostics import explained_shares, gain_of_last, warn_before
+from warpshadow.inverse.diagnostics import gain_of_last, warn_before
 from warpshadow.inverse.model import Model
+from warpshadow.inverse.verdict import explained_shares
 
 
 def scene(size: float = 4.0) -> ws.Scene:
@@ -168,7 +169,8 @@ def at(*bodies: ws.Body) -> ws.Scene:
 def shares(start: ws.Scene, target: np.ndarray, **options) -> dict[int, float]:
     problem = Problem(start, Target(target, **options), Pose(0))
     context = problem.context(torch.device("cpu"))
-    return explained_shares(Model(problem, context, Stage()), problem.start(context))
+    model, values = Model(problem, context, Stage()), problem.start(context)
+    return explained_shares(model, values, model.images(values))
 
 
 def test_a_body_is_explained_where_targets_show_it_and_its_shadow():

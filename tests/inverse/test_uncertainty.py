@@ -21,9 +21,9 @@ from warpshadow.inverse import (
     Target,
     write_result,
 )
-from warpshadow.inverse.diagnostics import small_stage
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.uncertainty import CANDIDATE_SPACING, NormalMatrix, candidates_along_flat_direction
+from warpshadow.inverse.verdict import small_stage
 
 NOISE = 0.05
 DIFFERENCE = 0.03  # central differences of a loss that bends where edges pass the centers of pixels

@@ -84,6 +84,9 @@ class CellBasis:
         vectors.setflags(write=False)
         object.__setattr__(self, "directions", vectors)
 
+    def __repr__(self) -> str:
+        return f"CellBasis({self.size} cells)"
+
     @property
     def size(self) -> int:
         """Number of coefficients."""

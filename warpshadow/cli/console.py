@@ -39,6 +39,7 @@ app = typer.Typer(
 
 # Exit statuses beside 0, 1 (a mistake in a file or value) and 2 (a mistake in the command line).
 DIVERGED = 3
+UNEXPLAINED = 4
 INTERRUPTED = 130
 
 Device = Annotated[str, typer.Option(help="Where to compute: cpu, cuda:0, …")]

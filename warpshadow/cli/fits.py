@@ -10,7 +10,17 @@ from typing import Annotated, Any, Optional
 
 import typer
 
-from warpshadow.cli.console import DIVERGED, Device, Quiet, app, clear_errors, device_of, note, report_interrupt
+from warpshadow.cli.console import (
+    DIVERGED,
+    UNEXPLAINED,
+    Device,
+    Quiet,
+    app,
+    clear_errors,
+    device_of,
+    note,
+    report_interrupt,
+)
 from warpshadow.viewer import PORT, FitViewer
 
 
@@ -50,10 +60,11 @@ def fit(
     """Fit the free parameters of a scene to images; run again, it resumes where it was interrupted.
 
     The folder gets scene.toml, which `warpshadow render` renders, and all that it names. Exit status 3: something
-    became NaN or Inf, and the folder has the best values before that.
+    became NaN or Inf, and the folder has the best values before that; 4: the result does not explain the images.
 
     With many fits, each has a subfolder, and table.csv says how they ended; finished fits are not run again. One that
-    fails costs only itself. Exit status 1: some failed; 3: none did, but some became NaN or Inf.
+    fails costs only itself. Exit status 1: some failed; else 3: some became NaN or Inf; else 4: some do not explain
+    their images.
     """
     from warpshadow.inverse import checkpoint as checkpoints
     from warpshadow.inverse.checkpoint import CHECKPOINT, PREVIEW, check_folder
@@ -114,6 +125,9 @@ def fit(
     if has_diverged:
         typer.secho(f"error: {result.reason}; {output} has the best values before that", fg="red", err=True)
         raise typer.Exit(DIVERGED)
+    if not result.verdict.is_explained:
+        typer.secho(f"error: {output} does not explain its images: {result.verdict}", fg="red", err=True)
+        raise typer.Exit(UNEXPLAINED)
 
 
 def _fit_many(fit_path: Path | list[Path], output: Path, view: bool, is_quiet: bool, **options: Any) -> None:
@@ -136,13 +150,19 @@ def _fit_many(fit_path: Path | list[Path], output: Path, view: bool, is_quiet: b
     for ending in endings:
         if not ending.is_good:
             typer.secho(f"error: {ending.name} {ending.reason}: {ending.error}", fg="red", err=True)
+        elif ending.doubt:
+            typer.secho(f"error: {ending.name} does not explain its images: {ending.doubt}", fg="red", err=True)
     reasons = [ending.reason for ending in endings]
     counts = ", ".join(f"{reasons.count(reason)} {reason}" for reason in dict.fromkeys(reasons))
+    doubts = sum(ending.is_good and bool(ending.doubt) for ending in endings)
+    counts += f"; {doubts} of them do not explain their images" * (doubts > 0)
     note(f"{output / TABLE}: {counts}", is_quiet)
     if "failed" in reasons:
         raise typer.Exit(1)
     if "diverged" in reasons:
         raise typer.Exit(DIVERGED)
+    if doubts:
+        raise typer.Exit(UNEXPLAINED)
 
 
 @contextlib.contextmanager

@@ -25,7 +25,12 @@ SceneOrMesh = Annotated[
 _mesh = functools.partial(typer.Option, rich_help_panel="Options of a mesh, which scene files have as keys")
 
 
-_SIZES = ("--width", "--height", "--resolution", "--res")  # options that other programs have for the size of an image
+_OPTIONS_ELSEWHERE = {
+    **dict.fromkeys(("--width", "--height", "--resolution", "--res"), "write --size WIDTH HEIGHT"),
+    "--spp": "write --samples COUNT, of --method ray-traced; scene files also have supersampling, samples a pixel "
+    "across and down, and directions of [visibility]",
+}
+"""Options of other programs, and those in their place."""
 
 
 class MeshCommand(typer.core.TyperCommand):
@@ -34,8 +39,8 @@ class MeshCommand(typer.core.TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the command line."""
         for name in (text.partition("=")[0] for text in args):
-            if name in _SIZES:
-                ctx.fail(f"No such option: {name} (write --size WIDTH HEIGHT)")
+            if name in _OPTIONS_ELSEWHERE:
+                ctx.fail(f"No such option: {name} ({_OPTIONS_ELSEWHERE[name]})")
         return super().parse_args(ctx, _with_whole_size(args))
 
 

@@ -34,7 +34,7 @@ from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import QuasiNewton
 from warpshadow.inverse.report import write_result
 from warpshadow.inverse.result import Result
-from warpshadow.inverse.schedule import Stage, deformation_stages, photograph_stages, pose_stages
+from warpshadow.inverse.schedule import Stage, deformation_stages, photograph_stages, pose_stages, unknown_pose_stages
 from warpshadow.inverse.target import Target
 from warpshadow.inverse.uncertainty import PoseUncertainty, Uncertainty
 from warpshadow.viewer import FitViewer
@@ -82,5 +82,6 @@ __all__ = [
     "photograph_stages",
     "pose_stages",
     "short_adam",
+    "unknown_pose_stages",
     "write_result",
 ]

@@ -16,9 +16,10 @@ from warpshadow.assets.image import write_image
 from warpshadow.check import AnyPath
 from warpshadow.device.progress import progress_bar, remark
 from warpshadow.inverse import checkpoint as checkpoints
+from warpshadow.inverse.anywhere import candidates_anywhere
 from warpshadow.inverse.diagnostics import warn_before, warn_of
 from warpshadow.inverse.free.base import Free, Values
-from warpshadow.inverse.model import torch_on_one_thread
+from warpshadow.inverse.model import Model, torch_on_one_thread
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.quasi_newton import Curvature, QuasiNewton
 from warpshadow.inverse.result import Result
@@ -114,6 +115,9 @@ class _Descent:
         scatter = self.stages[self.stage].scatter
         if count > 0 and scatter == "flat":
             return candidates_along_flat_direction(self.problem, self.context, values, count)
+        if count > 0 and scatter == "anywhere":
+            model = Model(self.problem, self.context, self.stages[self.stage])
+            return candidates_anywhere(model, values, count, self.seed)
         generator = torch.Generator().manual_seed(self.seed)
 
         def perturbed(free: Free, number: int) -> Values:
@@ -421,9 +425,10 @@ def fit(
         )
     seconds = statistics.median(durations) if durations else math.nan
     values = descent.best if descent.reason else descent.best_so_far()
+    result = Result(problem, descent.context, values, descent.losses, reason, seconds, descent.stages[-1])
     if reason in GOOD_ENDINGS and durations:  # not of one that had ended before
-        warn_of(problem, descent.context, values, descent.stages[-1], descent.losses[-1], reason)
-    return Result(problem, descent.context, values, descent.losses, reason, seconds)
+        warn_of(result)
+    return result
 
 
 def _descend(

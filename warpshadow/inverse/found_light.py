@@ -20,11 +20,11 @@ from warpshadow.assets.color import auto_exposure
 from warpshadow.assets.known_light import as_light
 from warpshadow.assets.light import KnownLightArgument
 from warpshadow.assets.picture import Picture
-from warpshadow.inverse.diagnostics import small_stage
 from warpshadow.inverse.free import Light
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
+from warpshadow.inverse.verdict import small_stage
 from warpshadow.inverse.world import FitContext
 from warpshadow.maths.directions import fibonacci
 from warpshadow.maths.sh import equirectangular_directions, pixel_solid_angles
@@ -76,6 +76,9 @@ class FoundLight:
 
     def _repr_png_(self) -> bytes:
         return self.picture()._repr_png_()
+
+    def __repr__(self) -> str:
+        return f"FoundLight({self})"
 
     def __str__(self) -> str:
         return f"{self.undetermined_share:.0%} of the sphere was not determined by the images"

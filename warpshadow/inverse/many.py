@@ -60,6 +60,7 @@ class Ending:
         iterations: Of all stages.
         loss_before, loss_after: With regularizers.
         seconds: From when its last worker began with it.
+        doubt: The verdict of a result that does not explain its targets, "" of one that does.
         parameters: Fitted numbers by their keys in scene files, if they are few: "bunny.translation", …
         warnings: Warnings that the fit gave.
     """
@@ -71,6 +72,7 @@ class Ending:
     loss_before: float | None = None
     loss_after: float | None = None
     seconds: float | None = None
+    doubt: str = ""
     parameters: dict[str, list[float]] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
@@ -295,6 +297,7 @@ def _run_fit(job: _FitJob) -> Ending:
         sum(map(len, result.losses)),
         report.loss_before,
         report.loss_after,
+        doubt="" if result.verdict.is_explained else str(result.verdict),
         parameters=result.figures,
     )
 

@@ -61,10 +61,10 @@ class Report:
         Args:
             folder: Made if it is not there. It gets the scene as :func:`warpshadow.write_scene` writes it, to be
                 rendered again; light.exr of light in spherical harmonics, too; summary.toml (how the fit ended, the
-                fitted parameters that are a few numbers, and of each view the camera and the exposure, which a scene
-                does not have); light.png of free light, striped where the images did not determine it; parameters.npz
-                (all values, as the fit holds them); before.png and after.png beside target.png; weights.png, of a
-                robust loss; and loss.png where matplotlib is installed.
+                verdict, the fitted parameters that are a few numbers, and of each view the camera and the exposure,
+                which a scene does not have); light.png of free light, striped where the images did not determine it;
+                parameters.npz (all values, as the fit holds them); before.png and after.png beside target.png;
+                weights.png, of a robust loss; and loss.png where matplotlib is installed.
         Returns:
             The files.
         """
@@ -110,7 +110,11 @@ class Report:
         unsure = self._uncertainty_table()
         figures = {json.dumps(key): item if len(item) > 1 else item[0] for key, item in self.result.figures.items()}
         of_fit = {"figures": figures} if figures else {}
-        return {"fit": fit, **of_fit, **known_entries, **unsure, "view": views, "image": images}
+        verdict = self.result.verdict
+        judged: toml_tables.Table = {"is_explained": verdict.is_explained, "image_error": verdict.image_error}
+        judged = {key: value for key, value in judged.items() if value is not None}
+        judged |= {"shown": verdict.shown} if verdict.shown else {}
+        return {"fit": fit, "verdict": judged, **of_fit, **known_entries, **unsure, "view": views, "image": images}
 
     def _uncertainty_table(self) -> toml_tables.Table:
         """Standard deviations of poses, light and exposures; a warning for each body that hardly is where it is."""
@@ -119,12 +123,7 @@ class Report:
             return {}
         table: toml_tables.Table = {}
         for name, pose in uncertainty.poses.items():
-            table[name] = {
-                "shift": pose.shift.tolist(),
-                "turn": pose.turn,
-                "explained": pose.explained,
-                "least": str(pose),
-            }
+            table[name] = {"shift": pose.shift.tolist(), "turn": pose.turn, "least": str(pose)}
             if pose.is_flat:
                 check.warn(
                     f"{name} is uncertain by more than {MAX_POSE_UNCERTAINTY:.0%} of its size; {pose}. "

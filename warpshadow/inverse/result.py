@@ -15,6 +15,7 @@ from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.schedule import Stage
 from warpshadow.inverse.uncertainty import Uncertainty, uncertainty
+from warpshadow.inverse.verdict import Verdict, verdict
 from warpshadow.inverse.world import FitContext, FittedScene
 from warpshadow.scene.scene import Scene
 
@@ -31,6 +32,7 @@ class Result:
         reason: Why the fit ended: "converged", "finished" (all iterations done), "stopped" (on its page), or the name
             of a non-finite quantity.
         seconds: Median time of an iteration of the last stage [s].
+        last: The last stage.
     """
 
     problem: Problem
@@ -39,6 +41,7 @@ class Result:
     losses: list[list[float]] = field(repr=False)
     reason: str
     seconds: float
+    last: Stage = field(default=Stage(), repr=False)
 
     def __repr__(self) -> str:
         free = ", ".join(self.values)
@@ -64,9 +67,14 @@ class Result:
         return found_light(self.scene.light, self.problem, self.context, self.values)
 
     @functools.cached_property
+    def verdict(self) -> Verdict:
+        """Whether it explains the targets: a descent that converged may have found another minimum."""
+        return verdict(self.problem, self.context, self.values, self.last)
+
+    @functools.cached_property
     def uncertainty(self) -> Uncertainty | None:
         """Uncertainty of its few parameters, such as poses and exposures; None without any."""
-        return uncertainty(self.problem, self.context, self.values, self.found)
+        return uncertainty(self.problem, self.context, self.values, self.found, self.verdict)
 
     @property
     def cameras(self) -> list[Camera]:

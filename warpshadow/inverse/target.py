@@ -123,6 +123,11 @@ class Target:
         check.finite("image", image)
         object.__setattr__(self, "image", image)
 
+    def __repr__(self) -> str:
+        height, width = self.image.shape[:2]
+        parts = {"a mask": self.mask is not None, "a camera": self.camera is not None, "outlines": bool(self.outlines)}
+        return f"Target({', '.join([f'{width} × {height}', *(name for name, has in parts.items() if has)])})"
+
     def _undistorted(self, image: np.ndarray, distortion: npt.ArrayLike) -> np.ndarray:
         """The image of a pinhole; its mask as well, which is 0 where the lens saw nothing."""
         coefficients = checked_distortion(distortion)

@@ -16,13 +16,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from warpshadow.inverse.diagnostics import MIN_EXPLAINED_SHARE, explained_shares, small_stage
 from warpshadow.inverse.free import Plane, Pose
 from warpshadow.inverse.free.base import PRIOR, Values
 from warpshadow.inverse.loss import clip_saturated
 from warpshadow.inverse.model import Model
 from warpshadow.inverse.problem import Problem
 from warpshadow.inverse.variable_projection import ProjectedModel
+from warpshadow.inverse.verdict import MIN_EXPLAINED_SHARE, Verdict, small_stage
 from warpshadow.inverse.world import FitContext, FittedScene
 
 MAX_UNCERTAIN_NUMBERS = 32
@@ -68,6 +68,9 @@ class PoseUncertainty:
         turn_distance = np.radians(self.least_turn) * self.diagonal / 2
         return float(np.hypot(np.linalg.norm(self.least), turn_distance)) > MAX_POSE_UNCERTAINTY * self.diagonal
 
+    def __repr__(self) -> str:
+        return f"PoseUncertainty({self})"
+
     def __str__(self) -> str:
         length = np.linalg.norm(self.least)
         direction_text = (
@@ -90,7 +93,7 @@ class Uncertainty:
         light: Standard deviation of the total radiance of a free light, as a part of it; None where it is not free.
     """
 
-    names: list[str]
+    names: list[str] = field(repr=False)
     covariance: np.ndarray = field(repr=False)
     poses: dict[str, PoseUncertainty]
     light: float | None
@@ -289,7 +292,7 @@ def _by_tiles(pixels: np.ndarray) -> np.ndarray:
 
 
 def uncertainty(
-    problem: Problem, context: FitContext, values: Mapping[str, Values], fitted: FittedScene
+    problem: Problem, context: FitContext, values: Mapping[str, Values], fitted: FittedScene, verdict: Verdict
 ) -> Uncertainty | None:
     """Find the uncertainty of a fit's few parameters; None without any."""
     if not _few_number_entries(problem, values):
@@ -297,9 +300,8 @@ def uncertainty(
     normal = NormalMatrix(problem, context, values)
     inverse = normal.directions @ np.linalg.inv(normal.normal_matrix)
     covariance = inverse @ normal.score_covariance @ inverse.T
-    explained = explained_shares(normal.model, normal.values)
     poses = {
-        pose.called(fitted): _pose_uncertainty(pose, normal, covariance, explained[pose.number])
+        pose.called(fitted): _pose_uncertainty(pose, normal, covariance, verdict.shown[pose.called(fitted)])
         for pose in problem.free_of(Pose)
     }
     names = [f"{name}.{key}[{number}]" for name, key, number in normal.parameter_entries]

@@ -21,6 +21,8 @@ from warpshadow.torch import TorchRenderer
 
 T = TypeVar("T")
 
+_FAR = 1e3  # distance at which a body is taken away [distances of the scene from the eye]
+
 
 def format_numbers(values: ArrayLike) -> str:
     """Numbers as reports have them."""
@@ -133,6 +135,12 @@ class World:
             return None
         poses = (torch.stack(parts) for parts in (self.rotations, self.translations, self.scales))
         return self.renderer.placed(*poses, rest=self.rest, moving=self.moving)
+
+    def take_away(self, number: int, context: FitContext) -> None:
+        """Move a body so far that neither it nor its shadow is seen."""
+        away = _FAR * float(context.distances.max()) * torch.eye(3, device=context.device)[1]
+        self.translations[number] = self.translations[number] - away
+        self.moving.add(number)
 
     def images(self) -> torch.Tensor:
         """Render the views: premultiplied linear RGB and coverage, [view, height, width, 4]; of lights in their place.

@@ -59,6 +59,9 @@ class LayerTensors(NamedTuple):
     masks: torch.Tensor
     """Part of each pixel that each body covers; [body, height, width]."""
 
+    def __repr__(self) -> str:
+        return f"LayerTensors({self.masks.shape[-1]} × {self.masks.shape[-2]}, {self.masks.shape[-3]} bodies)"
+
     @property
     def coverage(self) -> torch.Tensor:
         """Part of each pixel that any body covers, the alpha of the image; [height, width]."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -19,6 +20,9 @@ from warpshadow.scene.body import Body
 from warpshadow.scene.scene import BodyLike, Scene
 from warpshadow.torch import rotation_matrices
 
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
 _NO_TURN = {"axis-angle": (0.0, 0.0, 0.0), "quaternion": (0.0, 0.0, 0.0, 1.0), "6d": (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)}
 _TURNS = np.array(
     [sign * axis for axis in np.eye(3) for sign in (-1, 1)] + list(itertools.product((-1.0, 1.0), repeat=3))
@@ -27,6 +31,8 @@ _TURNS = np.array(
 
 _MAX_TILT = 1.0  # degrees from the nearest stable support up to which a body stands as the scene has it
 _OTHER_SIDE = 30.0  # degrees beyond which a body that touches its plane is meant to stand on another side
+_MAX_DEPTH = 3.0  # how far a body may stand on its plane [distances from the eye at the start]
+_GOLDEN_RATIO = 0.6180339887498949
 _MAX_GAP = 1e-3  # part of a body's diagonal by which it may be off a plane that it touches
 
 
@@ -85,6 +91,11 @@ class Pose(FreeOfBody):
             raise ValueError(f"spread: got {self.spread!r}, expected an angle from 0 to π")
         self._check_constraints()
         self._check_priors()
+
+    @property
+    def has_axis(self) -> bool:
+        """Whether it turns about one axis alone, but for a small tilt."""
+        return self.upright or self.axis is not None or (self.stands_on is not None and self.resting != "free")
 
     def _check_constraints(self) -> None:
         if self.resting is not None:
@@ -195,12 +206,55 @@ class Pose(FreeOfBody):
         from scipy.spatial.transform import Rotation
 
         copies = super().scattered(values, number, generator)
-        if values["turn"].numel() == 1 or self.tilt is not None:  # either way, and farther and farther
+        if self.has_axis:  # either way, and farther and farther
             copies["turn"][0] += self.spread * (number // 2 + 1) * (-1) ** number
             return copies
         is_listed = number < len(_TURNS)
         axis = _TURNS[number] if is_listed else torch.randn(3, generator=generator).numpy().astype(np.float64)
-        turn = Rotation.from_rotvec(self.spread * axis / np.linalg.norm(axis))
+        return copies | self._turned(values, Rotation.from_rotvec(self.spread * axis / np.linalg.norm(axis)))
+
+    def somewhere(
+        self,
+        values: Values,
+        context: FitContext,
+        number: int,
+        direction: np.ndarray,
+        distance: float,
+        generator: np.random.Generator,
+    ) -> Values:
+        """Turn the body any way, and move it onto a ray of the first view.
+
+        Args:
+            values: Where it is.
+            number: Of the place, from 0.
+            direction: Of the ray, shape [3].
+            distance: From the eye, in those of the body at the start; of one that stands on a plane, which says how far
+                it is, where the ray does not meet it.
+            generator: Of random rotations.
+        """
+        from scipy.spatial.transform import Rotation
+
+        possible, eye, start = self.constraint(context), context.cameras[0].eye, self._start_middle(context)
+        depth = distance * float(np.linalg.norm(start - eye))
+        if possible.plane is not None:  # at the height of its middle
+            normal = possible.plane.normal
+            on_plane = float(normal @ (start - eye)) / float(normal @ direction or 1e-9)
+            depth = on_plane if 0 < on_plane < _MAX_DEPTH * depth else depth
+        shift = (eye + depth * direction - start) / (
+            context.scene.bodies[self.number].scale * context.extent(self.number)
+        )
+        moved = super().scattered(values, number, torch.Generator()) | {
+            "shift": context.tensor(possible.shifts @ shift)
+        }
+        if self.has_axis:  # evenly around it
+            moved["turn"][0] = 2 * np.pi * (_GOLDEN_RATIO * number % 1)
+            return moved
+        return moved | self._turned(values, Rotation.random(random_state=generator))
+
+    def _turned(self, values: Values, turn: Rotation) -> Values:
+        """Values of its rotation, turned further."""
+        from scipy.spatial.transform import Rotation
+
         start = values["turn"].cpu().numpy()
         if self.rotation == "axis-angle":
             turned_vector = (turn * Rotation.from_rotvec(start)).as_rotvec()
@@ -208,7 +262,7 @@ class Pose(FreeOfBody):
             turned_vector = (turn * Rotation.from_quat(start)).as_quat()
         else:
             turned_vector = turn.apply(start.reshape(2, 3)).ravel()
-        return copies | {"turn": torch.tensor(turned_vector, dtype=torch.float32, device=values["turn"].device)}
+        return {"turn": torch.tensor(turned_vector, dtype=torch.float32, device=values["turn"].device)}
 
     def _posed(self, values: Values, context: FitContext) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rotation, translation and scale of the body: it turns about its middle m, which moves by the shift."""

@@ -32,6 +32,9 @@ class Layers(NamedTuple):
     masks: np.ndarray
     """Part of each pixel that a body covers; float32 of shape [body, height, width]. Their sum is the coverage."""
 
+    def __repr__(self) -> str:
+        return f"Layers({self.masks.shape[-1]} × {self.masks.shape[-2]}, {self.masks.shape[-3]} bodies)"
+
     def channels(self) -> dict[str, np.ndarray]:
         """As channels of an OpenEXR file: ``Z``, ``N.X``, ``N.Y``, ``N.Z``, ``body``, and ``mask.0``, … by bodies."""
         normals = {f"N.{axis}": self.normals[..., k] for k, axis in enumerate("XYZ")}
