@@ -10,12 +10,12 @@ from warpshadow import check
 from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.cuda_graph import is_readable
-from warpshadow.device.lanes import Chunk, as_chunks, is_positive_in_chunk, total_of_chunk, use_vector_registers
+from warpshadow.device.lanes import Chunk, as_chunks, total_of_chunk, use_vector_registers
 from warpshadow.device.launch import differentiable, launch, launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK
-from warpshadow.stages.light.transfer import broadcast_normal, prepare_cells, transfer_chunk
+from warpshadow.stages.light.transfer import broadcast_normal, prepare_cells, transfer_chunk, transfer_chunk_adjoint
 
 # receivers whose gradients to light a thread sums before it adds them to the others', on a CPU and on a GPU
 _SLICE, _GPU_SLICE = 256, 16
@@ -285,18 +285,15 @@ def _shade_cells_adjoint(
         x = directions[0, chunk]
         y = directions[1, chunk]
         z = directions[2, chunk]
-        cosine = wp.cw_mul(nx, x) + wp.cw_mul(ny, y) + wp.cw_mul(nz, z)
         adj_transfer = (
             adj[0] * light[light_batch, 0, chunk]
             + adj[1] * light[light_batch, 1, chunk]
             + adj[2] * light[light_batch, 2, chunk]
         )
+        t = transmittance[batch, receiver, chunk]
+        adj_t, adj_cosine = transfer_chunk_adjoint(nx, ny, nz, x, y, z, t, adj_transfer)
         if adj_transmittance:
-            adj_transmittance[batch, receiver, chunk] = adj_transmittance[batch, receiver, chunk] + wp.cw_mul(
-                adj_transfer, wp.max(cosine, Chunk(0.0))
-            )
-        adj_transfer = wp.cw_mul(adj_transfer, transmittance[batch, receiver, chunk])
-        adj_cosine = wp.cw_mul(adj_transfer, is_positive_in_chunk(cosine))
+            adj_transmittance[batch, receiver, chunk] = adj_transmittance[batch, receiver, chunk] + adj_t
         adj_x += wp.cw_mul(adj_cosine, x)
         adj_y += wp.cw_mul(adj_cosine, y)
         adj_z += wp.cw_mul(adj_cosine, z)
