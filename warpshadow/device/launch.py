@@ -105,7 +105,7 @@ def launch_with_adjoint(
     result: wp.array,
     variables: Sequence[wp.array | None],
     shared: Sequence[wp.array | None] = (),
-    outputs: Sequence[wp.array] = (),
+    outputs: Sequence[wp.array | None] = (),
     adj_inputs: Sequence[wp.array] = (),
     scratch: Sequence[Scratch | ScratchStruct] = (),
     adj_scratch: Sequence[Scratch | ScratchStruct] = (),

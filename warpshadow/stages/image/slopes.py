@@ -38,13 +38,14 @@ from dataclasses import replace
 
 import warp as wp
 
-from warpshadow.device.batch import instance_in, rows
+from warpshadow.device.batch import common_batch, instance_in, rows
 from warpshadow.device.launch import launch, without_gradient
+from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length
 from warpshadow.device.tape import record_adjoint
 from warpshadow.stages.image.film import sample_radiance
 from warpshadow.stages.image.outlines import SurfaceArrays, distance_to_end, make_surface_arrays
-from warpshadow.stages.raster.interpolation import interpolate, interpolate_values_adjoint, interpolate_weights_adjoint
+from warpshadow.stages.raster.interpolation import interpolate_values_adjoint, interpolate_weights_adjoint
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.screen import (
     direction_sign,
@@ -290,22 +291,25 @@ def moving_radiance(
     the receivers' points. By albedo samples are moved where it has a mean slope.
     """
     fragments = replace(fragments, barycentrics=without_gradient(fragments.barycentrics))
-    samples = sample_radiance(fragments, faces, shading, albedo)
+    light = None
+    if clip_positions.requires_grad:
+        count = common_batch({"fragments": fragments.face_ids, "shading": shading, "albedo": albedo})
+        light = empty((count, math.prod(albedo.shape[1:])), dtype=wp.vec3, device=albedo.device)
+    samples = sample_radiance(fragments, faces, shading, albedo, light)
     edge_colors = find_edge_colors(samples, silhouettes, clip_positions, shading, receivers, albedo)
-    if not clip_positions.requires_grad:
+    if light is None:
         return samples, edge_colors
     samples.requires_grad = True
 
     def adjoint() -> None:
-        light = interpolate(fragments, faces, without_gradient(shading))
         run = run_length(samples.device, samples.shape[2])
         launch(
             _add_shading_gradients,
-            math.prod(light.shape[1:]) // run,
+            light.shape[1] // run,
             cost=_COST * run * samples.shape[0],
             inputs=[
                 rows(samples),
-                rows(light),
+                light,
                 rows(fragments.face_ids),
                 faces,
                 shading,

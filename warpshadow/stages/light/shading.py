@@ -11,11 +11,11 @@ from warpshadow.device.array_checks import finite_arrays
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.lanes import Chunk, as_chunks, total_of_chunk, use_vector_registers
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.launch import differentiable, launch, launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK
-from warpshadow.stages.light.transfer import broadcast_normal, prepare_cells, transfer_chunk
+from warpshadow.stages.light.transfer import broadcast_normal, prepare_cells, transfer_chunk, transfer_chunk_adjoint
 
 # receivers whose gradients to light a thread sums before it adds them to the others', on a CPU and on a GPU
 _SLICE, _GPU_SLICE = 256, 16
@@ -227,18 +227,7 @@ def shade(transfer: wp.array, light: wp.array, *, maximum: float = check.LARGEST
 # ---------------------------------------------------------------------------------------------------- known light
 
 
-@wp.func
-def _light_of_chunk(transfer: Chunk, light: Chunk):
-    return wp.cw_mul(transfer, light)
-
-
-@wp.func_grad(_light_of_chunk)
-def _light_of_chunk_adjoint(transfer: Chunk, light: Chunk, adj_light: Chunk):
-    """Adjoint by transfer alone, since light is known."""
-    wp.adjoint[transfer] += wp.cw_mul(light, adj_light)
-
-
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _shade_cells(
     first_row: int,
     worker: int,
@@ -263,10 +252,54 @@ def _shade_cells(
         y = directions[1, chunk]
         z = directions[2, chunk]
         transfer = transfer_chunk(1.0, nx, ny, nz, x, y, z, transmittance[batch, receiver, chunk])
-        red += _light_of_chunk(transfer, light[light_batch, 0, chunk])
-        green += _light_of_chunk(transfer, light[light_batch, 1, chunk])
-        blue += _light_of_chunk(transfer, light[light_batch, 2, chunk])
+        red += wp.cw_mul(transfer, light[light_batch, 0, chunk])
+        green += wp.cw_mul(transfer, light[light_batch, 1, chunk])
+        blue += wp.cw_mul(transfer, light[light_batch, 2, chunk])
     shading[batch, receiver] = weight * wp.vec3(total_of_chunk(red), total_of_chunk(green), total_of_chunk(blue))
+
+
+@wp.kernel(enable_backward=False)
+def _shade_cells_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    transmittance: wp.array3d(dtype=Chunk),
+    normals: wp.array2d(dtype=wp.vec3),
+    directions: wp.array2d(dtype=Chunk),
+    weight: float,
+    light: wp.array3d(dtype=Chunk),
+    adj_shading: wp.array2d(dtype=wp.vec3),
+    # out
+    adj_transmittance: wp.array3d(dtype=Chunk),
+    adj_normals: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver:  with t̄_q = w L_q·s̄,  T̄_q += max(n·ω_q, 0) t̄_q,  n̄ += Σ T_q t̄_q ω_q where n·ω_q > 0."""
+    batch, receiver = split_row(first_row + wp.tid(), adj_shading.shape[1])
+    light_batch = instance_in(batch, light.shape[0])
+    nx, ny, nz = broadcast_normal(normals[batch, receiver])
+    adj = weight * adj_shading[batch, receiver]
+    adj_x = Chunk(0.0)
+    adj_y = Chunk(0.0)
+    adj_z = Chunk(0.0)
+    for chunk in range(directions.shape[1]):
+        x = directions[0, chunk]
+        y = directions[1, chunk]
+        z = directions[2, chunk]
+        adj_transfer = (
+            adj[0] * light[light_batch, 0, chunk]
+            + adj[1] * light[light_batch, 1, chunk]
+            + adj[2] * light[light_batch, 2, chunk]
+        )
+        t = transmittance[batch, receiver, chunk]
+        adj_t, adj_cosine = transfer_chunk_adjoint(nx, ny, nz, x, y, z, t, adj_transfer)
+        if adj_transmittance:
+            adj_transmittance[batch, receiver, chunk] = adj_transmittance[batch, receiver, chunk] + adj_t
+        adj_x += wp.cw_mul(adj_cosine, x)
+        adj_y += wp.cw_mul(adj_cosine, y)
+        adj_z += wp.cw_mul(adj_cosine, z)
+    if adj_normals:
+        adj_normal = wp.vec3(total_of_chunk(adj_x), total_of_chunk(adj_y), total_of_chunk(adj_z))
+        adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
 
 
 def shade_cells(
@@ -295,8 +328,12 @@ def shade_cells(
     check.shape("light", light.shape, ("batch", len(directions)))
     finite_arrays({"light": light}, maximum=maximum)
     use_vector_registers(__name__, device)
-    shading = empty(normals.shape, dtype=wp.vec3, device=device)
-    cost = _RECEIVER_COST + _COEFFICIENT_COST * len(directions)
-    inputs = [*cells, as_chunks(_channels(light))]
-    launch(_shade_cells, shading.size, inputs=inputs, outputs=[shading], cost=cost)
-    return shading
+    return launch_with_adjoint(
+        _shade_cells,
+        _shade_cells_adjoint,
+        normals.size,
+        inputs=[*cells, as_chunks(_channels(light))],
+        result=empty(normals.shape, dtype=wp.vec3, device=device),
+        variables=cells[:2],
+        cost=_RECEIVER_COST + _COEFFICIENT_COST * len(directions),
+    )

@@ -22,9 +22,10 @@ from warpshadow.device.lanes import (
     lane_type,
     make_lane_functions,
     module_options,
+    total_of_chunk,
     use_vector_registers,
 )
-from warpshadow.device.launch import differentiable, launch
+from warpshadow.device.launch import differentiable, launch, launch_with_adjoint
 from warpshadow.device.memory import empty, require_gradient, zeros
 from warpshadow.device.parallel import Scratch, scratch_slot, split_row
 from warpshadow.maths import sh
@@ -284,19 +285,14 @@ def transfer_chunk(weight: float, nx: Chunk, ny: Chunk, nz: Chunk, x: Chunk, y: 
     return wp.cw_mul(weight * wp.max(cosine, Chunk(0.0)), transmittance)
 
 
-@wp.func_grad(transfer_chunk)
+@wp.func(inline=True)
 def transfer_chunk_adjoint(
-    weight: float, nx: Chunk, ny: Chunk, nz: Chunk, x: Chunk, y: Chunk, z: Chunk, transmittance: Chunk, adj: Chunk
+    nx: Chunk, ny: Chunk, nz: Chunk, x: Chunk, y: Chunk, z: Chunk, transmittance: Chunk, adj_transfer: Chunk
 ):
-    """T̄_q = w max(n·ω_q, 0) t̄_q,  n̄ = Σ w T_q t̄_q ω_q where n·ω_q > 0, by the vector units."""
+    """The adjoint of `transfer_chunk` by transmittance, and by the cosine where that is above 0; w is in t̄."""
     cosine = wp.cw_mul(nx, x) + wp.cw_mul(ny, y) + wp.cw_mul(nz, z)
-    weighted = weight * adj
-    wp.adjoint[transmittance] += wp.cw_mul(weighted, wp.max(cosine, Chunk(0.0)))
-    is_up = is_positive_in_chunk(cosine)
-    adj_cosine = wp.cw_mul(wp.cw_mul(weighted, transmittance), is_up)
-    wp.adjoint[nx] += wp.cw_mul(adj_cosine, x)
-    wp.adjoint[ny] += wp.cw_mul(adj_cosine, y)
-    wp.adjoint[nz] += wp.cw_mul(adj_cosine, z)
+    adj_cosine = wp.cw_mul(wp.cw_mul(adj_transfer, transmittance), is_positive_in_chunk(cosine))
+    return wp.cw_mul(adj_transfer, wp.max(cosine, Chunk(0.0))), adj_cosine
 
 
 def prepare_cells(transmittance: wp.array, normals: wp.array, directions: np.ndarray) -> list[Any]:
@@ -310,7 +306,7 @@ def prepare_cells(transmittance: wp.array, normals: wp.array, directions: np.nda
     return [as_chunks(transmittance.contiguous()), normals, chunks, 4.0 / count]
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _transfer_directions(
     first_row: int,
     worker: int,
@@ -333,6 +329,43 @@ def _transfer_directions(
         transfer[batch, receiver, chunk] = transfer_chunk(weight, nx, ny, nz, x, y, z, t)
 
 
+@wp.kernel(enable_backward=False)
+def _transfer_directions_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    transmittance: wp.array3d(dtype=Chunk),
+    normals: wp.array2d(dtype=wp.vec3),
+    directions: wp.array2d(dtype=Chunk),
+    weight: float,
+    adj_transfer: wp.array3d(dtype=Chunk),
+    # out
+    adj_transmittance: wp.array3d(dtype=Chunk),
+    adj_normals: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a receiver:  T̄_q += w max(n·ω_q, 0) t̄_q,  n̄ += Σ w T_q t̄_q ω_q where n·ω_q > 0."""
+    batch, receiver = split_row(first_row + wp.tid(), normals.shape[1])
+    nx, ny, nz = broadcast_normal(normals[batch, receiver])
+    adj_x = Chunk(0.0)
+    adj_y = Chunk(0.0)
+    adj_z = Chunk(0.0)
+    for chunk in range(directions.shape[1]):
+        x = directions[0, chunk]
+        y = directions[1, chunk]
+        z = directions[2, chunk]
+        t = transmittance[batch, receiver, chunk]
+        adj = weight * adj_transfer[batch, receiver, chunk]
+        adj_t, adj_cosine = transfer_chunk_adjoint(nx, ny, nz, x, y, z, t, adj)
+        if adj_transmittance:
+            adj_transmittance[batch, receiver, chunk] = adj_transmittance[batch, receiver, chunk] + adj_t
+        adj_x += wp.cw_mul(adj_cosine, x)
+        adj_y += wp.cw_mul(adj_cosine, y)
+        adj_z += wp.cw_mul(adj_cosine, z)
+    if adj_normals:
+        adj_normal = wp.vec3(total_of_chunk(adj_x), total_of_chunk(adj_y), total_of_chunk(adj_z))
+        adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal
+
+
 def directional_transfer(transmittance: wp.array, normals: wp.array, directions: np.ndarray) -> wp.array:
     """Transfer vectors to light in cells of directions: T_q max(n·ω_q, 0) · (4π/Q) / π.
 
@@ -349,6 +382,13 @@ def directional_transfer(transmittance: wp.array, normals: wp.array, directions:
     transfer = empty(transmittance.shape, dtype=wp.float32, device=device)
     if transmittance.requires_grad or normals.requires_grad:
         require_gradient(transfer)  # before it is seen as chunks
-    cost = _CELL_COST * len(directions)
-    launch(_transfer_directions, normals.size, inputs=inputs, outputs=[as_chunks(transfer)], cost=cost)
+    launch_with_adjoint(
+        _transfer_directions,
+        _transfer_directions_adjoint,
+        normals.size,
+        inputs=inputs,
+        result=as_chunks(transfer),
+        variables=inputs[:2],
+        cost=_CELL_COST * len(directions),
+    )
     return transfer
