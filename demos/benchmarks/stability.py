@@ -443,6 +443,8 @@ def main(output: Path) -> None:
     ws.quiet()
     # of squarings that are held: some cases are for them
     warnings.filterwarnings("ignore", message="log-SH visibility")
+    # of turns by a learning rate of 1e6
+    warnings.filterwarnings("ignore", message="parameters: got an axis-angle vector")
 
     print_header("scene", "visibility")
     scenes = twins.hard_scenes()

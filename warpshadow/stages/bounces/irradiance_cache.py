@@ -11,7 +11,9 @@ from warpshadow.maths.spatial_sort import z_order
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-CACHE_POINT_COUNT = 2048  # cache points of an image: of 256 × 256 pixels one in 32
+CACHE_POINT_COUNT = 4096
+"""Cache points of an image: of 256 × 256 pixels one in 16. Small bodies have few: with 2048 a jar beside the spot of a
+lamp was 11% too dark and chess pieces 3.5% off a path tracer, with 4096 5% and 3.0%, with 8192 3% and 2.9%."""
 
 _NEIGHBORS = 3
 
