@@ -18,7 +18,8 @@ from warpshadow.pipeline.bodies.geometry import Geometry
 from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.bodies.self_visibility import SelfLookup
 from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached, identity
-from warpshadow.pipeline.receivers.groups import Group, find_portions
+from warpshadow.pipeline.receivers.grouping import find_portions
+from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces, ShadingContext, receiver_text
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.found_visibility import CellVisibility, HarmonicVisibility
@@ -311,7 +312,7 @@ class VisibilityNode(Node):
         self.method, self._portions_of = method, _find_portions_of(points)
         self._result_of, self._join = result_of, self.join if join is None else join
         self._progress, weak_points = method.progress and light is not None, points.weak_reference
-        suffix, planes = points.suffix if suffix is None else suffix, points.blocker_kinds.planes
+        suffix, planes = points.suffix if suffix is None else suffix, points.blocker_kinds.plane_bodies
         item_text = functools.partial(receiver_text, weak_points)
         rows = {
             "visibility": ExplainRow(
@@ -428,7 +429,7 @@ def _why_unblocked(method: SphereMethod, points: ShadingContext) -> str:
         return method.why_no_shadows
     blockers, kinds, static_bodies = method.scene_blockers, points.blocker_kinds, points.static_bodies
     if not blockers.has_any(kinds):
-        return f"no body {'but flat ones ' if kinds.planes else ''}has blockers"
+        return f"no body {'but flat ones ' if kinds.plane_bodies else ''}has blockers"
     moving, static, _ = points.counts()
     blocks_static = static_bodies and (method.adds_cached_rows or blockers.has_any(kinds, static_bodies.moving))
     if moving or (static and blocks_static):
