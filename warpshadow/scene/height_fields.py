@@ -3,7 +3,7 @@
 Spheres in a sheet bulge out of both sides. Where nobody sees one side, they may lie behind it, as deep as they like.
 """
 
-import functools
+import weakref
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +46,10 @@ class Land(NamedTuple):
     is_bowl: bool  # whether panels are better blockers: it is deep, and no body stands between it and its panels
 
 
+_SOLIDS: weakref.WeakKeyDictionary[Body, dict[tuple["weakref.ref[Body]", ...], Land | None]]
+_SOLIDS = weakref.WeakKeyDictionary()  # for as long as bodies live: a scene asks several times of each open one
+
+
 def solid_behind(body: Body, others: tuple[Body, ...]) -> Land | None:
     """Close a body that is land behind.
 
@@ -54,10 +58,14 @@ def solid_behind(body: Body, others: tuple[Body, ...]) -> Land | None:
         above each other; others stand on both sides, as of a tent, or on none; or the side on which they stand does not
         look up, as under a roof, past which light comes.
     """
-    return None if body.mesh.surface.is_closed or body.mesh.is_flat else _solid_behind(body, others)
+    if body.mesh.surface.is_closed or body.mesh.is_flat:
+        return None
+    known, key = _SOLIDS.setdefault(body, {}), tuple(map(weakref.ref, others))
+    if key not in known:
+        known[key] = _solid_behind(body, others)
+    return known[key]
 
 
-@functools.lru_cache(128)  # a scene asks several times of each open body
 def _solid_behind(body: Body, others: tuple[Body, ...]) -> Land | None:
     """The solid behind an open, bent body, if it is land."""
     mesh, to_own = body.mesh, into_own_space(body)

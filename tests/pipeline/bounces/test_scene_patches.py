@@ -37,7 +37,7 @@ def test_black_bodies_send_nothing(merged_scene):
 
 def test_flat_bodies_have_a_grid_whose_back_nobody_sees(merged_scene):
     patches = ScenePatches(merged_scene)
-    assert patches.planes == (1,)
+    assert patches.plane_bodies == (1,)
     assert patches.of_body(1).grid.sides == 1
     assert patches.of_body(0).grid is None
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import warpshadow as ws
-from warpshadow.pipeline.receivers.groups import find_portions
+from warpshadow.pipeline.receivers.grouping import find_portions
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.stages.receivers.quadtree import TOLERANCE
 from warpshadow.torch import TorchRenderer

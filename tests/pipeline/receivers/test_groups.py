@@ -10,7 +10,6 @@ import warp as wp
 
 import warpshadow as ws
 from warpshadow.assets.mesh import Mesh
-from warpshadow.pipeline.bodies.blockers import GroupBlockers
 from warpshadow.pipeline.receivers import groups
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.stages.planes.fronts import NearestBlockers
@@ -78,7 +77,7 @@ def test_portions_have_their_receivers_part_of_each_array(monkeypatch):
     points = wp.array(np.repeat(numbers[None, :, None], 3, axis=2), dtype=wp.vec3)
     nearest = NearestBlockers(points, wp.zeros((1, 10)), wp.array(numbers, dtype=wp.int32))
     spans = Span(0, 0, 3), Span(1, 3, 10)
-    group = groups.Group(points, points, GroupBlockers(), points, spans, nearest_blockers=nearest)
+    group = groups.Group(points, points, groups.GroupBlockers(), points, spans, nearest_blockers=nearest)
     portions = list(group.portions())
     assert [portion.first for portion in portions] == [0, 3, 7]
     assert [portion.spans for portion in portions] == [(Span(0, 0, 3),), (Span(1, 0, 4),), (Span(1, 0, 3),)]

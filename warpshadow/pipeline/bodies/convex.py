@@ -6,57 +6,13 @@ panels are chords of bent cloth, in which its receivers do not lie.
 """
 
 import functools
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
-import numpy as np
 import warp as wp
 
 from warpshadow.maths.convex import ConvexPart
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.scene.blockers import blocking_parts, find_solids
 from warpshadow.stages.convex.convex_blockers import ConvexBlockers, ConvexBody, PlacedParts
-from warpshadow.stages.convex.coverage import part_coverage
-from warpshadow.stages.receivers.body_spans import Span
-
-
-class GroupConvexParts(NamedTuple):
-    """Convex parts around some receivers."""
-
-    blockers: ConvexBlockers
-    placed_parts: PlacedParts
-    bodies: tuple[int, ...] = ()  # as ``blockers`` numbers them; each blocks no light of receivers that lie on it
-    on_surface: bool = False  # whether receivers lie on the parts, which are those of one body
-
-    @property
-    def placed_arrays(self) -> Mapping[str, wp.array]:
-        """Where they are."""
-        return {"parts": self.placed_parts.corners}
-
-    def number_of(self, body: int) -> int:
-        """The number that a body has here; −1 for none."""
-        return self.bodies.index(body) if body in self.bodies else -1
-
-    def coverage(
-        self,
-        points: wp.array,
-        horizon_normals: wp.array | None,
-        directions: np.ndarray,
-        radius: float | None = None,
-        spans: Sequence[Span] = (),
-    ) -> wp.array:
-        """Coverage of cells by them for receivers in spans, see :func:`.part_coverage`. Differentiable: points."""
-        return part_coverage(
-            points,
-            self.placed_parts,
-            self.blockers,
-            directions,
-            radius=radius,
-            horizon_normals=horizon_normals,
-            body_spans=spans,
-            self_bodies=[self.number_of(span.body) for span in spans] or [-1],
-            on_surface=self.on_surface,
-        )
 
 
 class SceneConvexParts:

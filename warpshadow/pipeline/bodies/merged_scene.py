@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import itertools
 from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import TYPE_CHECKING
 
@@ -381,13 +382,10 @@ class MergedScene:
         centers, radii = (concatenate([array[:, first:end] for first, end in ranges], counts) for array in spheres)
         return centers, radii
 
-    def spheres_among(self, bodies: Sequence[int], body: int | None) -> tuple[int, int]:
-        """Begin and end of each body's spheres among the spheres of some bodies, rising; (0, 0) for other bodies."""
-        if body is None or body not in bodies:
-            return 0, 0
-        counts, place = self.sphere_counts, bodies.index(body)
-        first = int(counts[list(bodies[:place])].sum())
-        return first, first + int(counts[body])
+    def sphere_ranges(self, bodies: Sequence[int]) -> dict[int, tuple[int, int]]:
+        """Begin and end of each body's spheres among the spheres of some bodies, rising."""
+        ends = np.cumsum(self.sphere_counts[list(bodies)]).tolist() if bodies else []
+        return dict(zip(bodies, itertools.pairwise([0, *ends]), strict=True))
 
     @staticmethod
     def ranges_of(starts: np.ndarray, bodies: Collection[int]) -> list[tuple[int, int]]:

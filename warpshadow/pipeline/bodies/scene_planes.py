@@ -6,7 +6,6 @@ Instead, the share of a cell of directions that a plane covers is computed.
 
 import functools
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -22,19 +21,6 @@ from warpshadow.stages.sparse import SparseMatrix, multiply
 
 _ROUNDING = 1e-5  # height over a plane, in sizes of its body, up to which a point counts as in it
 _CORNERS = 64  # directions in which the vertices of a body are sought that are farthest out
-
-
-class GroupPlanes(NamedTuple):
-    """Flat bodies around some receivers."""
-
-    blockers: PlaneBlockers
-    frames: wp.array  # where they are, vec3 of shape [batch, 3 · plane]
-    self_plane: int | None = None  # the one that the receivers are part of
-
-    @property
-    def placed_arrays(self) -> Mapping[str, wp.array]:
-        """Where they are."""
-        return {"planes": self.frames}
 
 
 class ScenePlanes:

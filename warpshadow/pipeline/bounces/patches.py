@@ -60,13 +60,13 @@ class ScenePatches:
     Args:
         merged_scene: The bodies.
     Attributes:
-        planes: The flat bodies among them.
+        plane_bodies: The flat bodies among them.
     """
 
     def __init__(self, merged_scene: MergedScene):
         self.merged_scene = merged_scene
         self._scene_planes = ScenePlanes(merged_scene)
-        self.planes = self._scene_planes.numbers
+        self.plane_bodies = self._scene_planes.numbers
         self._of_body: dict[int, Patches] = {}
         self._means: dict[tuple, SparseMatrix] = {}
         self._senders: dict[tuple[int, ...], Senders] = {}
@@ -122,7 +122,7 @@ class ScenePatches:
         if len(contacts) != 1:
             return None
         bodies = self.merged_scene.scene.bodies
-        points = np.concatenate([body.world_points() for n, body in enumerate(bodies) if n not in self.planes])
+        points = np.concatenate([body.world_points() for n, body in enumerate(bodies) if n not in self.plane_bodies])
         is_large = contacts[0].half_size * bodies[number].scale >= _MIN_CONTACT_SIZE * np.ptp(points, axis=0).max() / 2
         return contacts[0] if is_large else None
 
@@ -133,7 +133,7 @@ class ScenePatches:
         So bodies of one shape that differ little in size have the same.
         """
         bodies = self.merged_scene.scene.bodies
-        areas = {n: body.scale**2 * body.mesh.area for n, body in enumerate(bodies) if n not in self.planes}
+        areas = {n: body.scale**2 * body.mesh.area for n, body in enumerate(bodies) if n not in self.plane_bodies}
         total, counts = sum(areas.values()), {}
         for number, area in areas.items():
             patch_count = _SCENE_PATCHES * area / total if total > 0 else _MIN_BODY_PATCHES
@@ -145,7 +145,7 @@ class ScenePatches:
 
     def senders(self, materials: Materials) -> Senders:
         """The bodies that are not known to be black, and flat ones that cast shadows, with their patches."""
-        casting = [number for number in self.planes if self.merged_scene.scene.bodies[number].casts_shadow]
+        casting = [number for number in self.plane_bodies if self.merged_scene.scene.bodies[number].casts_shadow]
         bodies = tuple(
             number
             for number in range(len(self.merged_scene.scene.bodies))

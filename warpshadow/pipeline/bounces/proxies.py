@@ -61,13 +61,13 @@ class Proxies:
             return None
         return SparseMatrix.from_matrix(overlays.before, device=self.merged_scene.device), overlays.distances
 
-    def range_of(self, body: int | None) -> tuple[int, int]:
+    def range_of(self, body: int) -> tuple[int, int]:
         """Where the proxies of a body begin and end."""
         first = self.senders.first
         if body in self.senders.bodies:
             sender_index = self.senders.bodies.index(body)
             return int(first[sender_index]), int(first[sender_index + 1])
-        begin, end = self.merged_scene.spheres_among(self.black_bodies, body)
+        begin, end = self.merged_scene.sphere_ranges(self.black_bodies).get(body, (0, 0))
         return (int(first[-1]) + begin, int(first[-1]) + end) if end else (0, 0)
 
     @functools.cached_property

@@ -1,7 +1,6 @@
 """The directional method: transmittance past blockers for cells of directions, lit by the light of each cell."""
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,14 +11,14 @@ from warpshadow.assets.known_light import KnownLight
 from warpshadow.device.memory import empty, from_numpy
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import cell_radius, fibonacci
-from warpshadow.pipeline.bodies.blockers import BlockerKinds, GroupSpheres
+from warpshadow.pipeline.bodies.blockers import BlockerKinds
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLookup
 from warpshadow.pipeline.methods.cell_lobes import CellLobes
 from warpshadow.pipeline.methods.glossy_cells import shading_with_cells_node
 from warpshadow.pipeline.methods.sharpest_cells import SharpestCells, find_share_of_sharpest_light, find_sharpest_cells
 from warpshadow.pipeline.node import Input, Node, field_of
-from warpshadow.pipeline.receivers.groups import Group
+from warpshadow.pipeline.receivers.groups import CoveringBlockers, Group, GroupConvexParts, GroupSpheres
 from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
 from warpshadow.pipeline.shading.found_visibility import CellCoverages, CellVisibility
@@ -35,13 +34,10 @@ from warpshadow.stages.light.cached_cells import CachedRows, cell_transfer, shad
 from warpshadow.stages.light.light_samples import CellSamples, cell_samples, even_samples, sample_map
 from warpshadow.stages.light.shading import shade_cells
 from warpshadow.stages.light.transfer import directional_transfer
-from warpshadow.stages.planes.coverage import plane_coverage
-from warpshadow.stages.planes.partial_cells import coverage_of_light
 from warpshadow.stages.raster.sides import split_sides
 from warpshadow.stages.rays.ray_tracing import trace_cells
 from warpshadow.stages.self_visibility.gather import multiply_transmittances
 from warpshadow.stages.self_visibility.sun_cells import trace_sun_cells
-from warpshadow.stages.visibility import directional
 from warpshadow.stages.visibility.directional import SOFTNESS
 from warpshadow.stages.visibility.sharp_cells import RADII_PER_HALF_ANGLE, SharpCells, blend_sharp_cells
 
@@ -74,7 +70,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
             light,
             self._directions,
             softness=self.visibility.softness,
-            has_planes=bool(blockers.plane_blockers),
+            has_planes=bool(blockers.plane_bodies),
             wants_sun=blockers.self_visibility.wants_rays,
             device=self.merged_scene.device,
         )
@@ -98,23 +94,18 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def find_visibility(self, group: Group, projected_light: ProjectedCells) -> CellVisibility:
         """Transmittance of a group past its own body, spheres and convex parts."""
-        directions = projected_light.blocking_directions
-        spheres, planes, convex_parts, _self_parts, _self_lookup, _body_sides = group.blockers
+        directions, blockers = projected_light.blocking_directions, group.blockers
         transmittance_self = self._transmittance_self(group, projected_light)
-        # cached cells have light although their middles are below the horizon
-        horizon_normals = group.normals if group.cached_rows is None else None
-        past_spheres, parts = transmittance_self, None
-        if spheres is not None:
-            factor = self._past_spheres(group, spheres, horizon_normals, projected_light)
+        past_spheres = transmittance_self
+        if blockers.spheres is not None:
+            factor = self._past_spheres(blockers.spheres, group, projected_light)
             past_spheres = factor if past_spheres is None else multiply_transmittances(past_spheres, factor)
-        if convex_parts is not None:
-            cover = functools.partial(group.coverage_around, horizon_normals)
-            parts = self._coverages(cover, projected_light)
+        parts = blockers.convex_parts and self._coverages(blockers.convex_parts, group, projected_light)
         visibility = CellVisibility(
             directions, None, transmittance_self, transmittance_self_and_spheres=past_spheres, part_coverages=parts
         )
         # planes multiply their share in later; only bounces need the product without them, too
-        if planes is not None and not self.merged_scene.scene.bounces:
+        if blockers.planes is not None and not self.merged_scene.scene.bounces:
             return visibility
         total = past_spheres if parts is None else self._past_coverages(past_spheres, parts, None, projected_light)
         if total is None:
@@ -122,13 +113,14 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
             total.fill_(1.0)
         return visibility._replace(transmittance_total=total)
 
-    def _coverages(self, cover: Callable[..., wp.array], projected_light: ProjectedCells) -> CellCoverages:
-        """Coverage of all cells and of sharp ones."""
-        coverage = cover(projected_light.blocking_directions)
+    def _coverages(self, kind: CoveringBlockers, group: Group, projected_light: ProjectedCells) -> CellCoverages:
+        """Coverage of all cells and of sharp ones by blockers of a kind."""
+        coverage = kind.coverage(group, projected_light.blocking_directions, samples=projected_light.samples)
         sharp_cells = projected_light.sharp_cells_past_planes
         if sharp_cells is None:
             return CellCoverages(coverage)
-        return CellCoverages(coverage, cover(sharp_cells.directions, radius=self._edge_radius(sharp_cells)))
+        radius = self._edge_radius(sharp_cells)
+        return CellCoverages(coverage, kind.coverage(group, sharp_cells.directions, radius=radius))
 
     def _past_coverages(
         self,
@@ -155,22 +147,12 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         softness = self.visibility.softness / SOFTNESS
         return softness * sharp_cells.scale * cell_radius(len(sharp_cells.directions)) / RADII_PER_HALF_ANGLE
 
-    def _past_spheres(
-        self, group: Group, spheres: GroupSpheres, horizon_normals: wp.array | None, projected_light: ProjectedCells
-    ) -> wp.array:
-        arguments, scales = (group.points, horizon_normals, spheres.centers, spheres.radii), self._scales
-        block = functools.partial(
-            directional.transmittance,
-            *arguments,
-            body_spans=group.spans,
-            skips=spheres.skips(group.spans),
-            clusters=spheres.clusters,
-        )
-        transmittance = block(projected_light.blocking_directions, **scales(1.0))
+    def _past_spheres(self, spheres: GroupSpheres, group: Group, projected_light: ProjectedCells) -> wp.array:
+        transmittance = spheres.transmittance(group, projected_light.blocking_directions, **self._scales(1.0))
         if projected_light.sharp_cells is None:
             return transmittance
         directions, slots, scale = projected_light.sharp_cells
-        sharp = block(directions, footprints=group.footprints, **scales(scale))
+        sharp = spheres.transmittance(group, directions, footprints=group.footprints, **self._scales(scale))
         return blend_sharp_cells(transmittance, sharp, slots, projected_light.spot_shares)
 
     def _scales(self, scale: float) -> dict[str, Any]:
@@ -188,31 +170,14 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
     def scene_blockers(self) -> SceneBlockers:
         """The blockers that the bodies are: planes, too, and convex parts."""
         planes = blocking_planes(self.merged_scene.scene)
-        return SceneBlockers(self.merged_scene, plane_blockers=planes, has_convex_parts=True, progress=self.progress)
+        return SceneBlockers(self.merged_scene, plane_bodies=planes, has_convex_parts=True, progress=self.progress)
 
     def find_visibility_past_planes(
         self, group: Group, visibility: CellVisibility, projected_light: ProjectedCells
     ) -> CellVisibility:
         """Transmittance past the flat bodies around a group, too."""
-        planes = group.blockers.planes
-        assert planes is not None
-        horizon_normals = group.normals if group.cached_rows is None else None
-        front_weights, points = group.fronts_of_planes
-        options: dict[str, Any] = {
-            "horizon_normals": horizon_normals,
-            "front_weights": front_weights,
-            "self_plane": planes.self_plane,
-        }
-        covered = self._coverages(
-            functools.partial(plane_coverage, points, planes.frames, planes.blockers, **options), projected_light
-        )
-        if projected_light.samples is not None and planes.blockers.has_holes:
-            cells = projected_light.blocking_directions, projected_light.samples
-            covered = covered._replace(
-                all_cells=coverage_of_light(
-                    points, covered.all_cells, planes.frames, planes.blockers, *cells, **options
-                )
-            )
+        assert group.blockers.planes is not None
+        covered = self._coverages(group.blockers.planes, group, projected_light)
         total = self._past_coverages(
             visibility.transmittance_self_and_spheres, covered, visibility.part_coverages, projected_light
         )
@@ -220,10 +185,11 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def _transmittance_self(self, group: Group, projected_light: ProjectedCells) -> wp.array | None:
         """Transmittance past the body of the receivers: by its parts, or looked up, and by rays where asked."""
-        if group.blockers.self_parts is not None:
-            coverages = self._coverages(group.self_coverage, projected_light)
+        lookup = group.blockers.self_blocker
+        if isinstance(lookup, GroupConvexParts):
+            coverages = self._coverages(lookup, group, projected_light)
             return self._past_coverages(None, coverages, None, projected_light)
-        transmittance_self, lookup = group.looked_up_transmittance(), group.blockers.self_lookup
+        transmittance_self = group.looked_up_transmittance()
         rays = lookup.rays if isinstance(lookup, SelfVisibilityLookup) else None
         if transmittance_self is None or rays is None or projected_light.sun is None:
             return transmittance_self

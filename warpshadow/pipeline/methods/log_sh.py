@@ -105,7 +105,7 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
             lobes = zeros(visibility.coefficients.shape, dtype=wp.float32, device=visibility.coefficients.device)
             add_rows(group.cached_rows, lobes, channel=1)
             return lobes
-        lookup = group.blockers.self_lookup
+        lookup = group.blockers.self_blocker
         if not isinstance(lookup, SelfVisibilityLobes):
             return None
         bands = projected_light.bands if visibility.coefficients is None else self._order

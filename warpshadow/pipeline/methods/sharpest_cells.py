@@ -14,8 +14,6 @@ from warpshadow.pipeline.shading.projected_cells import ProjectedCells
 from warpshadow.pipeline.shading.transfers import LARGEST_COEFFICIENT
 from warpshadow.stages.joint_coverage import transmittance_past
 from warpshadow.stages.light.shading import shade_cells
-from warpshadow.stages.planes.coverage import plane_coverage
-from warpshadow.stages.visibility import directional
 from warpshadow.stages.visibility.sharp_cells import SharpCells
 
 
@@ -74,30 +72,17 @@ def find_share_of_sharpest_light(
         Shape [batch, receiver]; None where nothing blocks.
     """
     directions, light, _, has_footprints, edge_radius, power = sharpest
-    points, normals = group.points, group.normals
-    spheres, planes, parts, _self_parts, _self_lookup, _body_sides = group.blockers  # none is of a flat body itself
-    if spheres is None and planes is None and parts is None:
-        return None
-    if spheres is not None:
-        footprints = group.footprints if has_footprints else None
+    footprints, transmittance = group.footprints if has_footprints else None, None
+    if group.blockers.spheres is not None:
         options: dict[str, Any] = {"softness": softness, "merging": merging, "footprints": footprints}
-        arguments = points, normals, spheres.centers, spheres.radii, directions
-        transmittance = directional.transmittance(*arguments, **options)
-    else:
-        transmittance = wp.full((*points.shape, CHUNK), 1.0, dtype=wp.float32, device=points.device)
-    coverages = []
-    if parts is not None:
-        coverages.append(group.coverage_around(normals, directions, edge_radius))
-    if planes is not None:
-        front_weights, points = group.fronts_of_planes
-        options = {"radius": edge_radius, "horizon_normals": normals, "front_weights": front_weights}
-        coverages.append(
-            plane_coverage(points, planes.frames, planes.blockers, directions, self_plane=planes.self_plane, **options)
-        )
+        transmittance = group.blockers.spheres.transmittance(group, directions, **options)
+    coverages = [kind.coverage(group, directions, radius=edge_radius) for kind in group.blockers.covering]
     if coverages:
         transmittance = transmittance_past(transmittance, *coverages)
-    lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
-    receiver_normals = normals.numpy()
+    if transmittance is None:
+        return None
+    lit = shade_cells(transmittance, group.normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
+    receiver_normals = group.normals.numpy()
     plane_normals = receiver_normals[:, :1]  # points of a plane have this normal or its opposite
     facing = plane_normals @ cell_directions.T  # [batch, 1, cell]
     whole = [4 / len(power) * np.maximum(cosines, 0) @ power for cosines in (facing, -facing)]

@@ -15,6 +15,7 @@ from warpshadow.device.constants import immutable
 from warpshadow.device.launch import without_gradient
 from warpshadow.device.tape import unrecorded
 from warpshadow.pipeline.bodies.blockers import Blockers
+from warpshadow.pipeline.receivers.grouping import blockers_around, group_spheres
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces
 from warpshadow.stages.receivers.find import points_of_fragments
@@ -54,7 +55,7 @@ def find_squares(
             seen = fragments_of_samples(fragments, probes[columns])
             probes_of_body = points_of_fragments(positions, normals, merged_scene.faces, seen, footprint_inputs)
             points, point_normals, footprints = probes_of_body
-            group = Group(points, point_normals, blockers.around(body), footprints)
+            group = Group(points, point_normals, blockers_around(blockers, group_spheres(blockers), body), footprints)
             portions = [share_of_sharpest_light(portion) for portion in group.portions()]
             known = [portion for portion in portions if portion is not None]
             if known:

@@ -1,31 +1,251 @@
-"""Receiver groups: receivers of one or many bodies that are lit by the same launches."""
+"""Receiver groups: receivers of one or many bodies that are lit by the same launches, and the blockers around them.
+
+A kind of blocker has the members of :class:`BlockersOfKind`, by which methods and lamps see it.
+"""
 
 from __future__ import annotations
 
 import functools
-import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, cut, expand
-from warpshadow.device.constants import constant
 from warpshadow.device.launch import varies
-from warpshadow.pipeline.bodies.blockers import Blockers, GroupBlockers, GroupSpheres
+from warpshadow.pipeline.bodies.scene_planes import BodySides
 from warpshadow.pipeline.bodies.self_visibility import SelfLookup, SelfVisibilityLookup
-from warpshadow.pipeline.receivers.static import StaticBodies
+from warpshadow.stages.convex.convex_blockers import ConvexBlockers, PlacedParts
+from warpshadow.stages.convex.coverage import part_coverage
 from warpshadow.stages.light.cached_cells import CachedRows
 from warpshadow.stages.planes.fronts import NearestBlockers, PlaneFronts, find_fronts
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers
 from warpshadow.stages.receivers.body_spans import Span, relative_spans
-from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.self_visibility.probes import ProbeWeights
-from warpshadow.stages.visibility.traversal import find_clusters
+from warpshadow.stages.visibility.traversal import ClusterTree
+
+if TYPE_CHECKING:  # kernels of lamps take time to import
+    from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples
 
 RECEIVERS_AT_ONCE = 1 << 13  # receivers of each instance that are lit at once where no gradient is asked for
+
+
+class BlockersOfKind(Protocol):
+    """Blockers of one kind around receivers."""
+
+    @property
+    def placed_arrays(self) -> Mapping[str, wp.array]:
+        """Arrays of shape [batch, …] that say where they are, by their names in messages."""
+
+    def log_transmittance(self, group: Group, samples: PlacedSamples, span: EmitterSpan, emitter: int) -> wp.array:
+        """Logarithm of the transmittance to the samples of an emitter, float32 of shape [batch, receiver, sample].
+
+        Neither the receivers' own body nor the emitter, a body, blocks. Differentiable: all arrays.
+        """
+
+
+class CoveringBlockers(BlockersOfKind, Protocol):
+    """Blockers of a kind whose share of each cell of directions is known."""
+
+    def coverage(
+        self, group: Group, directions: np.ndarray, radius: float | None = None, samples: np.ndarray | None = None
+    ) -> wp.array:
+        """Coverage (h, μ) of cells, vec4 of shape [batch, receiver, direction].
+
+        Args:
+            group: The receivers.
+            directions: Of the cells, [direction, 3].
+            radius: Of cells that do not tile the sphere [rad]; None for those that do.
+            samples: Directions drawn from the light of each cell, [direction, 8, 3], by which a kind may be more exact.
+        Differentiable: arrays of the group, and of the blockers.
+        """
+
+
+class GroupSpheres(NamedTuple):
+    """Spheres around a group."""
+
+    centers: wp.array  # vec3 of shape [batch, sphere]
+    radii: wp.array  # float32 of shape [batch, sphere]
+    ranges: Mapping[int, tuple[int, int]]  # spheres of each body: the first, and the one after the last
+    self_traced: tuple[int, ...] = ()  # bodies whose spheres block none of their own light
+    clusters: ClusterTree | None = None  # of the spheres, where they are found already
+
+    @property
+    def placed_arrays(self) -> Mapping[str, wp.array]:
+        """Where they are."""
+        return {"centers": self.centers, "radii": self.radii}
+
+    def skip(self, body: int | None) -> tuple[int, int]:
+        """Spheres that block no light of receivers on a body: the first, and the one after the last."""
+        return self.ranges[body] if body in self.self_traced and body in self.ranges else (0, 0)
+
+    def skips(self, spans: Iterable[Span]) -> list[tuple[int, int]]:
+        """These spheres for the receivers of each span."""
+        return [self.skip(span.body) for span in spans]
+
+    def transmittance(self, group: Group, directions: np.ndarray, **options: Any) -> wp.array:
+        """Transmittance of cells, with the options of :func:`.directional.transmittance`: how soft edges are."""
+        from warpshadow.stages.visibility.directional import transmittance
+
+        return transmittance(
+            group.points,
+            group.horizon_normals,
+            self.centers,
+            self.radii,
+            directions,
+            body_spans=group.spans,
+            skips=self.skips(group.spans),
+            clusters=self.clusters,
+            **options,
+        )
+
+    def log_transmittance(self, group: Group, samples: PlacedSamples, span: EmitterSpan, emitter: int) -> wp.array:
+        """Logarithm of the transmittance to an emitter, see :class:`BlockersOfKind`."""
+        from warpshadow.stages.emitters.sphere_transmittance import find_log_transmittance
+
+        skipped = self.skip(group.body), self.ranges.get(emitter, (0, 0))
+        arguments = group.points, group.normals, samples, span, self.centers, self.radii, skipped
+        return find_log_transmittance(*arguments)
+
+    def expanded(self, instances: int) -> GroupSpheres:
+        """Repeat spheres of a batch of 1 for every instance. Differentiable: centers, radii."""
+        centers, radii = expand(self.centers, instances), expand(self.radii, instances)
+        is_same = centers is self.centers and radii is self.radii
+        return self._replace(centers=centers, radii=radii, clusters=self.clusters if is_same else None)
+
+
+class GroupPlanes(NamedTuple):
+    """Flat bodies around a group."""
+
+    blockers: PlaneBlockers
+    frames: wp.array  # where they are, vec3 of shape [batch, 3 · plane]
+    bodies: tuple[int, ...]  # as ``blockers`` numbers them
+    body_sides: BodySides
+    self_plane: int | None = None  # the one that the receivers are part of
+
+    @property
+    def placed_arrays(self) -> Mapping[str, wp.array]:
+        """Where they are."""
+        return {"planes": self.frames}
+
+    def coverage(
+        self, group: Group, directions: np.ndarray, radius: float | None = None, samples: np.ndarray | None = None
+    ) -> wp.array:
+        """Coverage of cells, see :class:`CoveringBlockers`; of their light where samples are given and planes open."""
+        from warpshadow.stages.planes.coverage import plane_coverage
+        from warpshadow.stages.planes.partial_cells import coverage_of_light
+
+        front_weights, points = group.fronts_of_planes
+        options: dict[str, Any] = {
+            "horizon_normals": group.horizon_normals,
+            "front_weights": front_weights,
+            "self_plane": self.self_plane,
+        }
+        coverage = plane_coverage(points, self.frames, self.blockers, directions, radius=radius, **options)
+        assert coverage is not None  # others than their own are around the receivers
+        if samples is None or not self.blockers.has_holes:
+            return coverage
+        return coverage_of_light(points, coverage, self.frames, self.blockers, directions, samples, **options)
+
+    def log_transmittance(self, group: Group, samples: PlacedSamples, span: EmitterSpan, emitter: int) -> wp.array:
+        """Logarithm of the transmittance to an emitter, see :class:`BlockersOfKind`."""
+        from warpshadow.stages.emitters.plane_transmittance import find_log_transmittance_of_planes
+
+        emitter_plane = self.bodies.index(emitter) if emitter in self.bodies else -1
+        return find_log_transmittance_of_planes(
+            group.fronts_of_planes.lifted_points,
+            group.normals,
+            samples,
+            span,
+            self.frames,
+            self.blockers,
+            self.body_sides.sides_of(self.frames, self.blockers),
+            emitter,
+            (-1 if self.self_plane is None else self.self_plane, emitter_plane),
+        )
+
+
+class GroupConvexParts(NamedTuple):
+    """Convex parts around a group, or of the body on which it lies."""
+
+    blockers: ConvexBlockers
+    placed_parts: PlacedParts
+    bodies: tuple[int, ...] = ()  # as ``blockers`` numbers them; each blocks no light of receivers that lie on it
+    on_surface: bool = False  # whether receivers lie on the parts, which are those of one body
+
+    @property
+    def placed_arrays(self) -> Mapping[str, wp.array]:
+        """Where they are."""
+        return {"parts": self.placed_parts.corners}
+
+    @property
+    def is_of_one_body(self) -> bool:
+        """Whether it serves the receivers of one body alone, whose light its own parts block."""
+        return self.on_surface
+
+    def _number_of(self, body: int | None) -> int:
+        """The number that a body has here; −1 for none."""
+        return self.bodies.index(body) if body in self.bodies else -1
+
+    def coverage(
+        self, group: Group, directions: np.ndarray, radius: float | None = None, samples: np.ndarray | None = None
+    ) -> wp.array:
+        """Coverage of cells, see :class:`CoveringBlockers` and :func:`.part_coverage`."""
+        return part_coverage(
+            group.points,
+            self.placed_parts,
+            self.blockers,
+            directions,
+            radius=radius,
+            horizon_normals=group.horizon_normals,
+            body_spans=group.spans,
+            self_bodies=[self._number_of(span.body) for span in group.spans] or [-1],
+            on_surface=self.on_surface,
+        )
+
+    def log_transmittance(self, group: Group, samples: PlacedSamples, span: EmitterSpan, emitter: int) -> wp.array:
+        """Logarithm of the transmittance to an emitter, see :class:`BlockersOfKind`."""
+        from warpshadow.stages.emitters.convex_transmittance import find_log_transmittance_of_parts
+
+        skipped = self._number_of(group.body), self._number_of(emitter)
+        arguments = group.points, group.normals, samples, span, self.placed_parts, self.blockers, skipped
+        return find_log_transmittance_of_parts(*arguments)
+
+
+class GroupBlockers(NamedTuple):
+    """Blockers around a group of receivers, by kind; None where none of a kind blocks their light.
+
+    A body blocks light of receivers that lie on it by ``self_blocker`` alone, or by its spheres.
+    """
+
+    spheres: GroupSpheres | None = None
+    planes: GroupPlanes | None = None
+    convex_parts: GroupConvexParts | None = None
+    self_blocker: GroupConvexParts | SelfLookup | None = None  # of the receivers' bodies: parts of one, or rays
+    body_sides: BodySides | None = None  # on which side of planes these lie; None where they are not known
+
+    @property
+    def kinds(self) -> dict[str, BlockersOfKind]:
+        """The kinds that block light of others than their own body, by name."""
+        kinds = {"spheres": self.spheres, "planes": self.planes, "parts": self.convex_parts}
+        return {name: blockers for name, blockers in kinds.items() if blockers is not None}
+
+    @property
+    def covering(self) -> list[CoveringBlockers]:
+        """Of these the kinds that cover cells."""
+        return [blockers for blockers in (self.planes, self.convex_parts) if blockers is not None]
+
+    @property
+    def placed_arrays(self) -> dict[str, wp.array]:
+        """Where the blockers of all kinds are, by name."""
+        placed = [blockers.placed_arrays for blockers in self if blockers is not None]
+        return {name: array for arrays in placed for name, array in arrays.items()}
+
+    def expanded(self, instances: int) -> GroupBlockers:
+        """The blockers, with the spheres repeated for every instance. Differentiable: spheres."""
+        return self if self.spheres is None else self._replace(spheres=self.spheres.expanded(instances))
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,21 +273,14 @@ class Group:
         assert self.find_probe_weights is not None
         return self.find_probe_weights(self.first, self.spans)
 
-    def self_coverage(self, directions: np.ndarray, radius: float | None = None) -> wp.array:
-        """Coverage of cells by convex parts of the receivers' own body."""
-        assert self.blockers.self_parts is not None
-        return self.blockers.self_parts.coverage(self.points, self.normals, directions, radius)
-
-    def coverage_around(
-        self, horizon_normals: wp.array | None, directions: np.ndarray, radius: float | None = None
-    ) -> wp.array:
-        """Coverage of cells by convex parts of other bodies."""
-        assert self.blockers.convex_parts is not None
-        return self.blockers.convex_parts.coverage(self.points, horizon_normals, directions, radius, self.spans)
+    @property
+    def horizon_normals(self) -> wp.array | None:
+        """Normals, below whose horizons nothing is lit; None for cached cells, whose light may be above it."""
+        return self.normals if self.cached_rows is None else None
 
     def looked_up_transmittance(self) -> wp.array | None:
         """Transmittance past the receivers' own bodies, [batch, receiver, cell]; None where none is looked up."""
-        lookup = self.blockers.self_lookup
+        lookup = self.blockers.self_blocker
         if not isinstance(lookup, SelfVisibilityLookup):
             return None
         return lookup.transmittance(self.normals, self.probe_weights, self.spans)
@@ -81,7 +294,8 @@ class Group:
 
     def find_fronts(self, frames: wp.array, planes: PlaneBlockers, self_plane: int | None) -> PlaneFronts:
         """Which part of each plane's front the receivers see, and the receivers lifted off planes they lie in."""
-        sides = None if self.blockers.body_sides is None else self.blockers.body_sides.sides_of(frames, planes)
+        body_sides = self.blockers.body_sides if self.spans else None
+        sides = None if body_sides is None else body_sides.sides_of(frames, planes)
         arguments = self.points, self.normals, sides, self.nearest_blockers, frames, planes
         return find_fronts(*arguments, spans=self.spans, self_plane=self_plane)
 
@@ -129,117 +343,3 @@ def _cut_spans(spans: Iterable[Span]) -> Iterator[tuple[Span, ...]]:
                 portion = []
             portion.append(piece)
     yield tuple(portion)
-
-
-class GroupKey(NamedTuple):
-    """Values that hold for all receivers of a group: consecutive spans with equal ones form one."""
-
-    is_at_vertices: bool
-    is_glossy: bool
-    body: int | None  # of spans that need a group of their own
-    blockers: GroupBlockers
-
-
-def find_portions(
-    receivers: Receivers,
-    blockers: Blockers,
-    self_lookups: Mapping[int, SelfLookup] | None = None,
-    cached_rows: CachedRows | None = None,
-    static_normals: wp.array | None = None,
-    *,
-    by_body: bool = False,
-    static_bodies: StaticBodies | None,
-    nearest_spheres: np.ndarray | None,
-) -> Iterator[Group]:
-    """Put receivers into groups, and cut these into portions.
-
-    Args:
-        receivers: All of them.
-        blockers: Their surroundings.
-        self_lookups: Self-visibility of receivers, by body; None without any.
-        cached_rows: Cached transmittance past static bodies, for receivers on them.
-        static_normals: Normals of all vertices of static bodies; None where any may move.
-        by_body: Whether receivers of each body are a group of their own.
-        static_bodies, nearest_spheres: Those of the :class:`.ShadingContext` whose receivers these are.
-    """
-    if static_bodies is not None and len(receivers.static_vertices):
-        assert static_normals is not None
-        moving = static_bodies.moving
-        points_and_normals = static_bodies.receivers(receivers.static_vertices, static_normals)
-        group_blockers = blockers.around(of_bodies=moving)
-        yield from Group(*points_and_normals, group_blockers, cached_rows=cached_rows).portions()
-        if not receivers.points.shape[1]:
-            return
-    nearest_blockers = _nearest_blockers(nearest_spheres, blockers)
-    if receivers.spans:
-        groups = _groups_by_body(receivers, blockers, self_lookups or {}, nearest_blockers, by_body)
-    else:
-        arrays = receivers.points, receivers.normals, blockers.around() if receivers.points.size else GroupBlockers()
-        groups = iter([Group(*arrays, receivers.footprints, nearest_blockers=nearest_blockers)])
-    for group in groups:
-        yield from group.portions()
-
-
-def _groups_by_body(
-    receivers: Receivers,
-    blockers: Blockers,
-    self_lookups: Mapping[int, SelfLookup],
-    nearest_blockers: NearestBlockers | None,
-    by_body: bool,
-) -> Iterator[Group]:
-    """Put spans of receivers into groups."""
-    assert receivers.vertices is not None
-    footprints = receivers.footprints
-    vertex_count, kinds, merged_scene = receivers.vertices.size, blockers.blocker_kinds, blockers.merged_scene
-    spheres = blockers.group_spheres(blockers.bodies, kinds.self_traced)
-    find_probe_weights = functools.partial(blockers.self_visibility.probe_weights, receivers)
-
-    @functools.cache
-    def clustered_spheres() -> GroupSpheres | None:
-        return spheres and spheres._replace(clusters=find_clusters(spheres.centers, spheres.radii, blockers.merging))
-
-    def key_of(span: Span) -> GroupKey:
-        body, lookup = span.body, self_lookups.get(span.body)
-        blocks_alone = spheres is None or spheres.ranges.get(body) == (0, spheres.radii.shape[1])
-        group_blockers = blockers.shapes_around(body)._replace(
-            spheres=None if blocks_alone else clustered_spheres(),
-            self_lookup=lookup,
-            body_sides=blockers.body_sides if body >= 0 else None,
-        )
-        if body < 0:
-            return GroupKey(span.first < vertex_count, False, None, group_blockers)
-        # where light bounces, these shadow themselves by their spheres (find_cell_transmittance)
-        has_self_spheres = merged_scene.scene.bounces and lookup is None and body not in kinds.solids
-        is_of_one_body = group_blockers.self_parts is not None or (lookup is not None and lookup.is_of_one_body)
-        is_alone = by_body or merged_scene.is_flat[body] or has_self_spheres or is_of_one_body
-        is_glossy = bool(merged_scene.is_glossy[body])
-        return GroupKey(span.first < vertex_count, is_glossy, body if is_alone else None, group_blockers)
-
-    for key, consecutive in itertools.groupby(receivers.spans, key_of):
-        spans = tuple(consecutive)
-        first, end = spans[0].first, spans[-1].end
-        points_and_normals = receivers.points, receivers.normals
-        if key.is_at_vertices and len(blockers.positions) == 1 < len(receivers.points):
-            points_and_normals = receivers.points[:1], receivers.normals[:1]  # all cameras see the same vertices
-        points, normals = (cut(array, first, end) for array in points_and_normals)
-        yield Group(
-            points,
-            normals,
-            key.blockers,
-            None if footprints is None or key.is_at_vertices else cut(footprints, first, end),
-            relative_spans(spans),
-            first,
-            None if nearest_blockers is None else nearest_blockers.cut(slice(first, end)),
-            key.body,
-            key.is_glossy,
-            find_probe_weights=find_probe_weights,
-        )
-
-
-def _nearest_blockers(nearest_spheres: np.ndarray | None, blockers: Blockers) -> NearestBlockers | None:
-    """The blockers nearest to the receivers; None where these are not patch samples."""
-    if nearest_spheres is None:
-        return None
-    merged_scene = blockers.merged_scene
-    sphere_arrays = merged_scene.spheres_of(merged_scene.nonplanar_bodies, blockers.spheres)
-    return NearestBlockers(*sphere_arrays, constant(nearest_spheres, wp.int32, merged_scene.device))

@@ -11,11 +11,8 @@ from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bodies.blockers import Blockers
-from warpshadow.pipeline.bodies.convex import GroupConvexParts
-from warpshadow.pipeline.bodies.scene_planes import GroupPlanes
-from warpshadow.pipeline.receivers.groups import Group
+from warpshadow.pipeline.receivers.groups import Group, GroupConvexParts
 from warpshadow.pipeline.shading.transfers import join_portions
-from warpshadow.stages.emitters.convex_transmittance import find_log_transmittance_of_parts
 from warpshadow.stages.emitters.emitter_self_visibility import EmitterSelfVisibility, look_up_self_visibility
 from warpshadow.stages.emitters.light import (
     find_directions_to_samples,
@@ -23,9 +20,7 @@ from warpshadow.stages.emitters.light import (
     replace_instances,
     sum_light,
 )
-from warpshadow.stages.emitters.plane_transmittance import find_log_transmittance_of_planes
 from warpshadow.stages.emitters.samples import EmitterSamples, EmitterSpan, PlacedSamples
-from warpshadow.stages.emitters.sphere_transmittance import find_log_transmittance
 from warpshadow.stages.emitters.spot_cones import weigh_by_beam
 from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.gloss.reflection import LobeLight
@@ -114,16 +109,11 @@ def _find_transmittances(
     merged_scene, points, normals = blockers.merged_scene, group.points, group.normals
     if not points.size:
         return
-    _spheres, planes, convex_parts, self_parts, _self_lookup, _body_sides = group.blockers
     transmittance_of_cells = (
-        transmittance_past(None, group.self_coverage(EMITTER_CELLS))
-        if self_parts is not None
+        transmittance_past(None, group.blockers.self_blocker.coverage(group, EMITTER_CELLS))
+        if isinstance(group.blockers.self_blocker, GroupConvexParts)
         else group.looked_up_transmittance()
     )
-    sphere_bodies = blockers.sphere_blockers(blockers.bodies)
-    spheres = merged_scene.spheres_of(sphere_bodies, blockers.spheres)
-    traced_body = group.body if group.body in blockers.blocker_kinds.self_traced else None
-    self_spheres = merged_scene.spheres_among(sphere_bodies, traced_body)
 
     @functools.cache
     def self_meshes() -> list[wp.Mesh | None]:
@@ -136,7 +126,6 @@ def _find_transmittances(
         is_on_emitter = body == group.body
         if is_on_emitter and hidden_by_itself is None:
             continue
-        skipped = self_spheres, merged_scene.spheres_among(sphere_bodies, body)
         transmittance_self = None
         if transmittance_of_cells is not None and not is_on_emitter:
             is_within = _find_where_enclosed(blockers, body, group.body)
@@ -155,12 +144,14 @@ def _find_transmittances(
         if hidden_by_itself is not None:
             lookup = points, placed_samples, span, hidden_by_itself
             transmittance_of_emitter = look_up_self_visibility(*lookup, is_on_emitter=is_on_emitter)
+        logs = {
+            f"log_of_{name}": kind.log_transmittance(group, placed_samples, span, body)
+            for name, kind in group.blockers.kinds.items()
+        }
         yield (
             span,
             find_transmittance_to_samples(
-                log_of_spheres=find_log_transmittance(points, normals, placed_samples, span, *spheres, skipped),
-                log_of_planes=planes and _log_of_planes(group, planes, blockers, placed_samples, span, body),
-                log_of_parts=convex_parts and _log_of_parts(group, convex_parts, placed_samples, span, body),
+                **logs,
                 transmittance_self=transmittance_self,
                 transmittance_of_emitter=weigh_by_beam(points, placed_samples, span, transmittance_of_emitter),
             ),
@@ -227,26 +218,3 @@ def trace_transmittances(
         )
         wp.copy(traced[instance], rows)
     return traced
-
-
-def _log_of_planes(
-    group: Group, planes: GroupPlanes, blockers: Blockers, placed_samples: PlacedSamples, span: EmitterSpan, body: int
-) -> wp.array:
-    """Logarithm of the transmittance of planes between a group and an emitter."""
-    numbers = blockers.blocker_kinds.planes
-    assert blockers.body_sides is not None
-    points, sides = group.fronts_of_planes.lifted_points, blockers.body_sides.sides_of(planes.frames, planes.blockers)
-    skipped = -1 if planes.self_plane is None else planes.self_plane, numbers.index(body) if body in numbers else -1
-    return find_log_transmittance_of_planes(
-        points, group.normals, placed_samples, span, planes.frames, planes.blockers, sides, body, skipped
-    )
-
-
-def _log_of_parts(
-    group: Group, parts: GroupConvexParts, placed_samples: PlacedSamples, span: EmitterSpan, body: int
-) -> wp.array:
-    """Logarithm of the transmittance of convex parts between a group and an emitter."""
-    skipped = -1 if group.body is None else parts.number_of(group.body), parts.number_of(body)
-    return find_log_transmittance_of_parts(
-        group.points, group.normals, placed_samples, span, parts.placed_parts, parts.blockers, skipped
-    )

@@ -29,13 +29,13 @@ class SceneBlockers:
 
     Args:
         merged_scene: The bodies.
-        plane_blockers: Bodies that block as the planes in which they lie, where they are not deformed.
+        plane_bodies: Bodies that block as the planes in which they lie, where they are not deformed.
         has_convex_parts: Whether bodies that consist of convex parts block by these.
         traces_self_visibility: Whether bodies' shadows on themselves may come from rays, not spheres.
         progress: Whether to show the progress of rays.
     Attributes:
-        planes: The bodies that lie in planes.
-        parts: The bodies that consist of convex parts.
+        scene_planes: The bodies that lie in planes.
+        scene_parts: The bodies that consist of convex parts.
         self_visibility: The bodies' shadows on themselves, from rays.
     """
 
@@ -43,14 +43,14 @@ class SceneBlockers:
         self,
         merged_scene: MergedScene,
         *,
-        plane_blockers: tuple[int, ...] = (),
+        plane_bodies: tuple[int, ...] = (),
         has_convex_parts: bool = False,
         traces_self_visibility: bool = True,
         progress: bool = False,
     ):
-        self._merged_scene, self.plane_blockers = merged_scene, plane_blockers
+        self._merged_scene, self.plane_bodies = merged_scene, plane_bodies
         self._has_convex_parts, self._traces_self_visibility = has_convex_parts, traces_self_visibility
-        self.planes, self.parts = ScenePlanes(merged_scene), SceneConvexParts(merged_scene)
+        self.scene_planes, self.scene_parts = ScenePlanes(merged_scene), SceneConvexParts(merged_scene)
         self.self_visibility = SelfVisibility(
             merged_scene, SceneReceivers(merged_scene).at_samples(), progress=progress
         )
@@ -65,16 +65,16 @@ class SceneBlockers:
         """
         scene = self._merged_scene.scene
         deformed = () if geometry is None or scene.bounces else geometry.deformed
-        planes = tuple(body for body in self.plane_blockers if body not in deformed)
+        plane_bodies = tuple(body for body in self.plane_bodies if body not in deformed)
         if rotations is None or not self._traces_self_visibility:
-            return ONLY_SPHERES._replace(planes=planes)
+            return ONLY_SPHERES._replace(plane_bodies=plane_bodies)
         why = tuple(self.self_visibility.why_spheres(body, geometry) for body in range(len(scene.bodies)))
         rigid = tuple(body for body, reason in enumerate(why) if not reason)
-        convex = tuple(body for body in rigid if body in self.parts.parts) if self._has_convex_parts else ()
-        solids = tuple(body for body in convex if body in self.parts.solids)
+        convex = tuple(body for body in rigid if body in self.scene_parts.parts) if self._has_convex_parts else ()
+        solids = tuple(body for body in convex if body in self.scene_parts.solids)
         traced = tuple(body for body in rigid if body not in solids)
         bulging_bodies = tuple(body for body, reason in enumerate(why) if reason and self._can_bulge[body])
-        return BlockerKinds(traced, rotations, why, planes, convex, solids, bulging_bodies)
+        return BlockerKinds(traced, rotations, why, plane_bodies, convex, solids, bulging_bodies)
 
     @functools.cached_property
     def _can_bulge(self) -> list[bool]:
@@ -92,16 +92,16 @@ class SceneBlockers:
 
     def place_blockers(self, kinds: BlockerKinds, positions: wp.array, spheres: tuple[wp.array, wp.array]) -> Blockers:
         """Place the blockers among bodies, by their vertices and spheres. Differentiable: these."""
-        frames = self.planes.frames(kinds.planes, positions) if kinds.planes else None
-        placed_parts = self.parts.place_parts(kinds.convex, positions) if kinds.convex else None
+        frames = self.scene_planes.frames(kinds.plane_bodies, positions) if kinds.plane_bodies else None
+        placed_parts = self.scene_parts.place_parts(kinds.convex, positions) if kinds.convex else None
         body_sides = None
-        if kinds.planes or (self.planes.numbers and self._merged_scene.scene.bounces):
-            body_sides = BodySides(self.planes, positions)
+        if kinds.plane_bodies or (self.scene_planes.numbers and self._merged_scene.scene.bounces):
+            body_sides = BodySides(self.scene_planes, positions)
         return Blockers(
             self._merged_scene,
             kinds,
-            planes=self.planes,
-            parts=self.parts,
+            scene_planes=self.scene_planes,
+            scene_parts=self.scene_parts,
             self_visibility=self.self_visibility,
             merging=self._merged_scene.scene.visibility.merging,
             positions=positions,
@@ -113,31 +113,28 @@ class SceneBlockers:
 
     def has_any(self, kinds: BlockerKinds, bodies: Iterable[int] | None = None) -> bool:
         """Whether some bodies, by default all, block light by spheres or convex parts."""
-        counts = self._sphere_counts(kinds) + self._part_counts(kinds)
-        return bool((counts if bodies is None else counts[list(bodies)]).sum())
+        counts = sum(self._counts(kinds).values())
+        return bool(np.sum(counts if bodies is None else counts[list(bodies)]))
 
-    def _sphere_counts(self, kinds: BlockerKinds) -> np.ndarray:
-        """Number of spheres by which each body blocks the light of others."""
-        counts = self._merged_scene.sphere_counts.copy()
-        counts[list(kinds.without_spheres)] = 0
-        return counts
-
-    def _part_counts(self, kinds: BlockerKinds) -> np.ndarray:
-        """Number of convex parts by which each body blocks the light of others."""
-        counts = np.zeros(len(self._merged_scene.scene.bodies), int)
+    def _counts(self, kinds: BlockerKinds) -> dict[str, np.ndarray]:
+        """Number of blockers of each kind but planes by which each body blocks the light of others, shape [body]."""
+        spheres = self._merged_scene.sphere_counts.copy()
+        spheres[list(kinds.without_spheres)] = 0
+        parts = np.zeros_like(spheres)
         for body in kinds.convex:
-            counts[body] = len(self.parts.parts[body])
-        return counts
+            parts[body] = len(self.scene_parts.parts[body])
+        return {"spheres": spheres, "convex parts": parts}
 
     def pairs_with(self, points: ShadingContext) -> str:
-        """Receivers and the spheres and convex parts that block them, in words."""
-        spheres, parts = self._sphere_counts(points.blocker_kinds), self._part_counts(points.blocker_kinds)
+        """Receivers and the blockers of all kinds but planes around them, in words."""
+        counts = self._counts(points.blocker_kinds)
 
-        def blockers(bodies: list[int]) -> str:
-            part_text = f" and {parts[bodies].sum():,} convex parts" if parts[bodies].sum() else ""
-            return f"up to {spheres[bodies].sum():,} spheres{part_text}"  # some are culled, or merged
+        def blockers(bodies: slice | list[int]) -> str:
+            sums = {name: numbers[bodies].sum() for name, numbers in counts.items()}
+            counted = [f"{count:,} {name}" for name, count in sums.items() if count or name == "spheres"]
+            return f"up to {' and '.join(counted)}"  # some are culled, or merged
 
-        item_text = f"{receiver_text(points, static=False)} × {blockers(list(range(len(spheres))))}"
+        item_text = f"{receiver_text(points, static=False)} × {blockers(slice(None))}"
         if points.static_bodies is None:
             return item_text
         moving = list(points.static_bodies.moving)
@@ -152,18 +149,18 @@ class SceneBlockers:
         ]
 
     def _kind_in_words(self, body: int, kinds: BlockerKinds) -> str:
-        if body in kinds.planes:
+        if body in kinds.plane_bodies:
             return "as a part of a plane: it is flat"
-        count = int(self._part_counts(kinds)[body])
-        parts = f"as {count} convex part{'s' * (count != 1)}"
-        is_costly = body in kinds.convex and sum(len(part.edges) for part in self.parts.parts[body]) > _COSTLY_EDGES
+        convex_parts = self.scene_parts.parts[body] if body in kinds.convex else []
+        parts = f"as {len(convex_parts)} convex part{'s' * (len(convex_parts) != 1)}"
+        is_costly = sum(len(part.edges) for part in convex_parts) > _COSTLY_EDGES
         costs = "; spheres, blockers = 256, take half of the time or less, and are up to twice as far off" * is_costly
         if body in kinds.solids:
             return f"{parts}, its own, too: it consists of them{costs}"
         why = kinds.why_spheres[body] if kinds.why_spheres else "the method looks up no rays"
         of_its_own = f"and its own by {f'spheres: {why}' if why else 'rays, traced once'}"
         if body in kinds.convex:
-            has_panels = any(map(is_panel, self.parts.parts[body]))
+            has_panels = any(map(is_panel, convex_parts))
             return f"{parts}: it is made of few {'panels' if has_panels else 'of them'}, {of_its_own}{costs}"
         count = int(self._merged_scene.sphere_counts[body])
         spheres = f"as {count} sphere{'s' * (count != 1)}"

@@ -11,7 +11,8 @@ from warpshadow.device.constants import IdentityKey
 from warpshadow.device.progress import progress_bar
 from warpshadow.pipeline.bodies.blockers import BlockerKinds
 from warpshadow.pipeline.node import Call, ExplainRow, Input, Node, detached, identity
-from warpshadow.pipeline.receivers.groups import Group, find_portions
+from warpshadow.pipeline.receivers.grouping import find_portions
+from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiver_text
 from warpshadow.pipeline.shading.found_visibility import CellVisibility, HarmonicVisibility
 from warpshadow.pipeline.shading.transfers import join_portions
@@ -64,7 +65,7 @@ class VisibilityNode(Node):
         self.method, self._portions_of = method, find_portions_of(points)
         self._result_of, self._join = result_of, self.join if join is None else join
         self._progress, weak_points = method.progress and light is not None, points.weak_reference
-        suffix, planes = points.suffix if suffix is None else suffix, points.blocker_kinds.planes
+        suffix, planes = points.suffix if suffix is None else suffix, points.blocker_kinds.plane_bodies
         item_text = functools.partial(receiver_text, weak_points)
         rows = {
             "visibility": ExplainRow(
@@ -182,7 +183,7 @@ def _why_unblocked(method: VisibilitySteps, points: ShadingContext) -> str:
         return method.why_no_shadows
     blockers, kinds, static_bodies = method.scene_blockers, points.blocker_kinds, points.static_bodies
     if not blockers.has_any(kinds):
-        return f"no body {'but flat ones ' if kinds.planes else ''}has blockers"
+        return f"no body {'but flat ones ' if kinds.plane_bodies else ''}has blockers"
     moving, static, _ = points.counts()
     blocks_static = static_bodies and (method.adds_cached_rows or blockers.has_any(kinds, static_bodies.moving))
     if moving or (static and blocks_static):

@@ -21,7 +21,7 @@ No receiver is nearer to a side than a margin, so that t is not 0. :mod:`.fronts
 height alone the weight of the front falls from 1 in the plane to 0 a margin below it, where the back has 1.
 """
 
-import functools
+import weakref
 
 import numpy as np
 import warp as wp
@@ -56,14 +56,21 @@ def check_planes(
         check.choice("self_plane", self_plane, range(planes.count))
 
 
-@functools.lru_cache(64)
+_ARRAYS: weakref.WeakKeyDictionary[PlaneBlockers, dict[tuple[float, int | None], PlaneArrays]]
+_ARRAYS = weakref.WeakKeyDictionary()  # for as long as the planes live
+
+
 def plane_arrays(planes: PlaneBlockers, radius: float, self_plane: int | None) -> PlaneArrays:
     """Plane blockers as seen in cells of a radius [rad] by receivers that are part of one, or of none."""
+    known, key = _ARRAYS.setdefault(planes, {}), (radius, self_plane)
+    if key in known:
+        return known[key]
     arrays = PlaneArrays()
     arrays.grids, arrays.levels, arrays.level_scales = planes.grids, planes.levels, planes.level_scales
     arrays.covered, arrays.edges, arrays.edge_axes = planes.covered, planes.edges, planes.edge_axes
     arrays.self_plane, arrays.radius = -1 if self_plane is None else self_plane, radius
     arrays.per_radius = 1 / arrays.radius
+    known[key] = arrays
     return arrays
 
 
