@@ -70,8 +70,9 @@ def find_portions(
     if receivers.spans:
         groups = _groups_by_body(receivers, blockers, self_lookups or {}, nearest_blockers, by_body)
     else:
-        around = blockers_around(blockers, group_spheres(blockers)) if receivers.points.size else GroupBlockers()
-        arrays = receivers.points, receivers.normals, around
+        has_receivers = receivers.points.size > 0
+        all_blockers = blockers_around(blockers, group_spheres(blockers)) if has_receivers else GroupBlockers()
+        arrays = receivers.points, receivers.normals, all_blockers
         groups = iter([Group(*arrays, receivers.footprints, nearest_blockers=nearest_blockers)])
     for group in groups:
         yield from group.portions()

@@ -82,7 +82,7 @@ class GroupSpheres(NamedTuple):
         return self.ranges[body] if body in self.self_traced and body in self.ranges else (0, 0)
 
     def skips(self, spans: Iterable[Span]) -> list[tuple[int, int]]:
-        """These spheres for the receivers of each span."""
+        """The skipped spheres of each span."""
         return [self.skip(span.body) for span in spans]
 
     def transmittance(self, group: Group, directions: np.ndarray, **options: Any) -> wp.array:
