@@ -63,7 +63,7 @@ class Verdict:
 
     @property
     def unexplained(self) -> dict[str, float]:
-        """Shares of the bodies of which targets show too little, by name."""
+        """Shares that targets show of bodies, by name, where they are too small."""
         return {name: shown_share for name, shown_share in self.shown.items() if shown_share < MIN_EXPLAINED_SHARE}
 
     def __str__(self) -> str:
