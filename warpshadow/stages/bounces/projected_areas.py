@@ -24,7 +24,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import cached_by_values, constant
-from warpshadow.device.launch import launch
+from warpshadow.device.launch import launch, launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.maths.directions import check_directions
@@ -127,7 +127,7 @@ def tilt_normals_off_planes(
     return tilted_normals
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _project(
     first_row: int,
     worker: int,
@@ -159,6 +159,49 @@ def _project(
         projected_areas[batch, patch, direction] = projected_area
 
 
+@wp.kernel(enable_backward=False)
+def _project_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    normals: wp.array2d(dtype=wp.vec3),
+    transmittance: wp.array3d(dtype=wp.float32),
+    starts: wp.array(dtype=wp.int32),
+    patch_samples: wp.array(dtype=wp.int32),
+    weights: wp.array(dtype=wp.float32),
+    directions: wp.array(dtype=wp.vec3),
+    opposite: wp.array(dtype=wp.int32),
+    length: int,
+    adj_projected_areas: wp.array3d(dtype=wp.float32),
+    # sums
+    adj_normals: wp.array2d(dtype=wp.vec3),
+    adj_transmittance: wp.array3d(dtype=wp.float32),
+):
+    """A thread owns a run of directions of a patch."""
+    i, run = wp.tid()
+    batch, patch = split_row(first_row + i, adj_projected_areas.shape[1])
+    normal_batch = instance_in(batch, normals.shape[0])
+    transmittance_batch = instance_in(batch, transmittance.shape[0])
+    for k in range(starts[patch], starts[patch + 1]):
+        patch_sample = patch_samples[k]
+        normal = normals[normal_batch, patch_sample]
+        adj_normal = wp.vec3()
+        for direction in range(run * length, (run + 1) * length):
+            cosine = -wp.dot(normal, directions[direction])
+            if cosine > 0.0:
+                adj_area = weights[k] * adj_projected_areas[batch, patch, direction]
+                opposite_transmittance = float(1.0)
+                if transmittance:
+                    opposite_transmittance = transmittance[transmittance_batch, patch_sample, opposite[direction]]
+                adj_cosine = adj_area * (_HIDDEN_WEIGHT + (1.0 - _HIDDEN_WEIGHT) * opposite_transmittance)
+                adj_normal -= adj_cosine * directions[direction]
+                if adj_transmittance:
+                    adj = adj_area * cosine * (1.0 - _HIDDEN_WEIGHT)
+                    wp.atomic_add(adj_transmittance, transmittance_batch, patch_sample, opposite[direction], adj)
+        if adj_normals:
+            wp.atomic_add(adj_normals, normal_batch, patch_sample, adj_normal)
+
+
 @cached_by_values
 def _directions_and_opposites(directions: np.ndarray, device: wp.Device) -> tuple[wp.array, wp.array]:
     """Directions of cells, and for each the cell nearest to its opposite."""
@@ -188,14 +231,16 @@ def find_projected_areas(
         check.shape("transmittance", transmittance.shape, ("batch", mean.shape[1], len(directions)))
     batch_count = common_batch({"normals": normals, "transmittance": transmittance})
     device = normals.device
-    projected_areas = empty((batch_count, mean.shape[0], len(directions)), dtype=wp.float32, device=device)
     length = run_length(device, len(directions))
-    launch(
+    # patches have samples of their own, but one may serve several instances
+    variables, shared = ([], [normals, transmittance]) if batch_count > 1 else ([normals, transmittance], [])
+    return launch_with_adjoint(
         _project,
+        _project_adjoint,
         (batch_count * mean.shape[0], len(directions) // length),
         inputs=[normals, transmittance, *mean.rows, *direction_arrays, length],
-        outputs=[projected_areas],
-        shared=[normals, transmittance] if batch_count > 1 else [],
+        result=empty((batch_count, mean.shape[0], len(directions)), dtype=wp.float32, device=device),
+        variables=variables,
+        shared=shared,
         cost=_CELL_COST * length,
     )
-    return projected_areas

@@ -17,7 +17,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
-from warpshadow.device.launch import launch
+from warpshadow.device.launch import launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.visibility.merging import CLUSTER_SIZE, MERGING, merged_count
@@ -56,7 +56,7 @@ def patches_of_clusters(
     return starts.astype(np.int32), np.concatenate([*patch_lists, []]).astype(np.int32)
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _tabulate(
     first_row: int,
     worker: int,
@@ -72,10 +72,7 @@ def _tabulate(
     # out
     proxy_radiance: wp.array3d(dtype=wp.vec4),
 ):
-    """A thread owns a run of directions of a proxy.
-
-    Shares are A / Σ A, so that sums are linear, as Warp's adjoint needs it.
-    """
+    """A thread owns a run of directions of a proxy; shares are A / Σ A."""
     i, run = wp.tid()
     batch, proxy = split_row(first_row + i, proxy_radiance.shape[1])
     radiosity_batch = instance_in(batch, radiosity.shape[0])
@@ -91,6 +88,52 @@ def _tabulate(
             light += patch_weight * radiosity[radiosity_batch, patch]
             weight_sum += patch_weight
         proxy_radiance[batch, proxy, direction] = wp.vec4(light[0], light[1], light[2], weight_sum)
+
+
+@wp.kernel(enable_backward=False)
+def _tabulate_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    radiosity: wp.array2d(dtype=wp.vec3),
+    projected_areas: wp.array3d(dtype=wp.float32),
+    patch_weights: wp.array2d(dtype=wp.vec3),
+    starts: wp.array(dtype=wp.int32),
+    patch_indices: wp.array(dtype=wp.int32),
+    area_shares: wp.array(dtype=wp.float32),
+    black_sphere_weights: wp.array(dtype=wp.float32),
+    length: int,
+    adj_proxy_radiance: wp.array3d(dtype=wp.vec4),
+    # sums
+    adj_radiosity: wp.array2d(dtype=wp.vec3),
+    adj_projected_areas: wp.array3d(dtype=wp.float32),
+    adj_patch_weights: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a run of directions of a proxy."""
+    i, run = wp.tid()
+    batch, proxy = split_row(first_row + i, adj_proxy_radiance.shape[1])
+    radiosity_batch = instance_in(batch, radiosity.shape[0])
+    areas_batch = instance_in(batch, projected_areas.shape[0])
+    weights_batch = instance_in(batch, patch_weights.shape[0])
+    for k in range(starts[proxy], starts[proxy + 1]):
+        patch = patch_indices[k]
+        patch_radiosity = radiosity[radiosity_batch, patch]
+        weight = patch_weights[weights_batch, patch][0]
+        adj_patch_radiosity = wp.vec3()
+        adj_weight = float(0.0)
+        for direction in range(run * length, (run + 1) * length):
+            area = projected_areas[areas_batch, patch, direction]
+            adj = adj_proxy_radiance[batch, proxy, direction]
+            adj_light = wp.vec3(adj[0], adj[1], adj[2])
+            adj_patch_radiosity += area_shares[k] * (weight * area + _AVERTED_WEIGHT) * adj_light
+            adj_counted_area = area_shares[k] * (wp.dot(adj_light, patch_radiosity) + adj[3])
+            adj_weight += area * adj_counted_area
+            if adj_projected_areas:
+                wp.atomic_add(adj_projected_areas, areas_batch, patch, direction, weight * adj_counted_area)
+        if adj_radiosity:
+            wp.atomic_add(adj_radiosity, radiosity_batch, patch, adj_patch_radiosity)
+        if adj_patch_weights:
+            wp.atomic_add(adj_patch_weights, weights_batch, patch, wp.vec3(adj_weight, 0.0, 0.0))
 
 
 def find_proxy_radiance(
@@ -137,14 +180,15 @@ def find_proxy_radiance(
     int_tables = [constant(np.asarray(values, np.int32), wp.int32, device) for values in (starts, patch_indices)]
     float_tables = [area_shares, np.where(area_sums > 0, 0.0, _BLACK_SPHERE_WEIGHT)]
     proxy_arrays = [*int_tables, *(constant(values.astype(np.float32), wp.float32, device) for values in float_tables)]
-    proxy_radiance = empty((batch_count, len(starts) - 1, projected_areas.shape[2]), dtype=wp.vec4, device=device)
-    length = run_length(device, projected_areas.shape[2])
-    launch(
+    direction_count = projected_areas.shape[2]
+    length = run_length(device, direction_count)
+    return launch_with_adjoint(
         _tabulate,
-        (batch_count * proxy_radiance.shape[1], projected_areas.shape[2] // length),
+        _tabulate_adjoint,
+        (batch_count * (len(starts) - 1), direction_count // length),
         inputs=[*arrays.values(), *proxy_arrays, length],
-        outputs=[proxy_radiance],
+        result=empty((batch_count, len(starts) - 1, direction_count), dtype=wp.vec4, device=device),
+        variables=[],
         shared=list(arrays.values()),
         cost=_CELL_COST * length,
     )
-    return proxy_radiance
