@@ -226,7 +226,7 @@ def _keeps_sides(positions: np.ndarray, faces: np.ndarray, begin: np.ndarray, en
 
 
 def _far_apart(faces: np.ndarray, begin: np.ndarray, ranks: np.ndarray, count: int) -> np.ndarray:
-    """Choose collapses around which no vertices are the same, those of low ranks first."""
+    """Choose collapses around which no vertices are the same, low ranks first."""
     rank, is_chosen = np.full(count, count), np.zeros(len(begin), bool)
     rank[begin] = ranks
     for _ in range(_ROUNDS_OF_CHOICE):

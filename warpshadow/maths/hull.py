@@ -14,7 +14,7 @@ from warpshadow.maths.convex import MAX_FACES, ConvexPart, is_panel
 from warpshadow.maths.directions import cell_radius
 
 MAX_ERROR = 0.03
-"""Mean error up to which a hull is taken, if it also is at most half of that of independent pieces. Measured, and
+"""Mean error up to which a hull is taken, if it is at most half the error of independent pieces, too. Measured, and
 that of independent ones: strips that touch 0.000 (0.146), pickets 0.002 (0.104), crates 0.003 (0.018), keys of a
 keyboard 0.009 (0.146), a blind 0.013 (0.112), slats of a shutter 0.021 (0.117), stairs 0.024 (0.120). Not taken: a
 table 0.015 (0.011), bricks 0.032 (0.157), a fence with rails 0.033 (0.095), books 0.042 (0.218), a chair 0.059 (0.034),

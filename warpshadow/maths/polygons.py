@@ -117,7 +117,7 @@ def _is_convex(corners: np.ndarray, normal: np.ndarray) -> bool:
 
 
 def _without_straight(points: np.ndarray, outline: list[int], gap: float) -> list[int]:
-    """Corners around a polygon, but for those on straight sides."""
+    """Corners around a polygon, without points on straight sides."""
     for corner in list(outline):
         index = outline.index(corner)
         before, after = outline[index - 1], outline[(index + 1) % len(outline)]

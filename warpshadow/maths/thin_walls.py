@@ -22,7 +22,7 @@ MIN_OPPOSED = 0.8
 foot 0.89, a bracket 0.46."""
 
 MAX_RIM = 0.15
-"""Area of the rim between the layers at most, over that of the surface: of a mug 0.02, a bowl 0.09, a rod 0.6."""
+"""Area of the rim between the layers at most, over the surface's area: of a mug 0.02, a bowl 0.09, a rod 0.6."""
 
 _MAX_FACES = 50_000
 _SAMPLES = 8192  # points of the surface that look for the other side

@@ -17,8 +17,8 @@ _MAX_BEND = 0.95
 """Cosine of the angle between neighboring segments at least, 18°: with 30° shadows of rings had corners."""
 
 _MAX_SWELL = 0.03
-"""Distance of the corners of a section from its middle, over that of straight segments, from 1 at most: rods are bent,
-not turned on a lathe. Grooves of a column would have no shadows on it."""
+"""Distance of a section's corners from its middle, over that distance where it is straight, from 1 at most: rods bend,
+and are not turned on a lathe. Grooves of a column would have no shadows on it."""
 
 _MAX_TWIST = 0.02  # 1 − cos α of the angle between the triangles of a quad at most, 11°; and error of the volume
 
@@ -27,7 +27,7 @@ class Tube(NamedTuple):
     """A tube, cut into straight segments."""
 
     sections: np.ndarray
-    """Vertices around it between segments and at its ends, those beside each other in one column, int of shape
+    """Vertices around it between segments and at its ends, neighbors along it in one column, int of shape
     [segment + 1, corner]: of a closed tube the last are the first."""
     segments: list[np.ndarray]  # triangles of the convex hull of two sections, which wind alike, [triangle, 3]
     gaps: np.ndarray  # largest distance of the surface from each segment [units of points], shape [segment]
@@ -94,7 +94,7 @@ def _bulge(points: np.ndarray, section: np.ndarray, next_section: np.ndarray, mi
 
 
 def _swell(radii: np.ndarray, chosen: np.ndarray) -> float:
-    """Largest part by which radii of sections, [section, corner], differ from those between chosen ones."""
+    """Largest part by which radii of sections, [section, corner], differ from radii between chosen sections."""
     rings = np.arange(len(radii))
     expected = np.stack([np.interp(rings, chosen, column) for column in radii[chosen].T], axis=1)
     return float(np.abs(radii / expected - 1).max())
