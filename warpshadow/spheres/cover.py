@@ -74,7 +74,7 @@ def greedy_cover(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> 
 
 
 def _cover_side(mesh: NormalizedMesh, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Pick balls that touch the side from which a mesh is seen, each near the point farthest from those before it."""
+    """Pick balls that touch the side from which a mesh is seen, each near the point farthest from balls before it."""
     points, _ = mesh.sample(SIDE_POINTS, rng)
     balls = medial_balls(mesh, SIDE_POINTS, rng)
     gaps, picked_balls = np.full(len(points), np.inf), []

@@ -180,7 +180,7 @@ def is_fitted(
 
 
 def fit_seconds(count: int | str) -> float:
-    """Estimate the time of a fit on one thread [s], by that of a bunny on a Zen 4."""
+    """Estimate the time of a fit on one thread [s], by the time of a bunny on a Zen 4."""
     return 8.4 if isinstance(count, str) else 1.3 + 0.013 * count
 
 

@@ -192,7 +192,7 @@ def outline_coverage(
 def coverage_adjoint(
     edges: wp.array(dtype=ViewedEdge), first: int, count: int, direction: wp.vec3, radius: float, adj_coverage: wp.vec4
 ):
-    """Add to the gradients of the edges' normals, of either function, by those of h and μ."""
+    """Add to the gradients of the edges' normals, of either function, by the gradients of h and μ."""
     per_area = 1.0 / (wp.pi * radius * radius)
     adj_moment = (per_area / radius) * wp.vec3(adj_coverage[1], adj_coverage[2], adj_coverage[3])
     for edge in range(first, first + count):

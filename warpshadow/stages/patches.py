@@ -324,7 +324,7 @@ def _bounding_spheres(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _find_outside(mesh: wp.Mesh, corners: np.ndarray, lift: float) -> tuple[np.ndarray, np.ndarray]:
-    """Find the pieces outside all parts of their body, and those inside that reach out of it.
+    """Find the pieces outside all parts of their body, and the pieces inside that reach out of it.
 
     Args:
         mesh: The body, of parts that are closed.

@@ -217,13 +217,13 @@ class SelfVisibility:
         assert receivers.vertices is not None
         bodies = tuple(dict.fromkeys(span.body for span in spans))
         end, vertex_count = first + spans[-1].end, receivers.vertices.size
-        places = spans, [bodies.index(span.body) for span in spans]
+        tables, table_indices = self._tables_of(bodies), [bodies.index(span.body) for span in spans]
         if first < vertex_count:
-            return self._tables_of(bodies).of_vertices(receivers.vertices[first:end], *places)
+            return tables.of_vertices(receivers.vertices[first:end], spans, table_indices)
         fragments, first, end = receivers.sample_fragments, first - vertex_count, end - vertex_count
         assert fragments is not None
-        seen = Fragments(cut(fragments.face_ids, first, end), cut(fragments.barycentrics, first, end))
-        return self._tables_of(bodies).of_samples(seen, *places)
+        cut_fragments = Fragments(cut(fragments.face_ids, first, end), cut(fragments.barycentrics, first, end))
+        return tables.of_samples(cut_fragments, spans, table_indices)
 
     def probe_weights_of(self, body: int, vertices: np.ndarray) -> ProbeWeights:
         """Where vertices of a body lie among its probes; backs are numbered after the last vertex."""
@@ -280,9 +280,9 @@ class SelfVisibility:
         normals, positions = self._normals(body), self.probes(body).positions
 
         def find() -> RayProbes:
-            places = np.tile(positions, (len(normals) // len(positions), 1))
-            at = (from_numpy(values, dtype=wp.vec3, device=self._merged_scene.device) for values in (places, normals))
-            return RayProbes(self._tree(body), *at)
+            as_array = functools.partial(from_numpy, dtype=wp.vec3, device=self._merged_scene.device)
+            points = np.tile(positions, (len(normals) // len(positions), 1))
+            return RayProbes(self._tree(body), as_array(points), as_array(normals))
 
         return self._cached_by_mesh(body, "ray probes", find)
 
@@ -414,24 +414,24 @@ class SelfVisibility:
 
         def trace(unfinished: Unfinished) -> VisibilityRows:
             points = from_numpy(probes.positions[: len(mesh.positions)], dtype=wp.vec3, device=device)
-            whole = wp.Mesh(points, from_numpy(faces.ravel(), dtype=wp.int32, device=device))
-            places, normals = probes.ray_origins, side * probes.normals
+            mesh_of_body = wp.Mesh(points, from_numpy(faces.ravel(), dtype=wp.int32, device=device))
+            origins, normals = probes.ray_origins, side * probes.normals
 
             def keep(bits: wp.array) -> None:
-                done = f"{len(bits):,} of {len(places):,} points"
+                done = f"{len(bits):,} of {len(origins):,} points"
                 unfinished.keep(lambda: {"bits": bits.numpy()}, done)
 
             with unrecorded():
                 rows = trace_rows(
                     self._tree(body),
-                    places,
+                    origins,
                     normals,
                     count,
                     cached_bits=unfinished.before.get("bits"),
                     store_bits=keep,
                     progress=self._progress,
                 )
-                is_buried = find_buried(whole, places, normals, rows, are_backs=side == _BACK)
+                is_buried = find_buried(mesh_of_body, origins, normals, rows, are_backs=side == _BACK)
                 return rows.dilated(find_dilation(probes, is_buried))
 
         return load_or_compute(

@@ -154,8 +154,10 @@ class BounceGatherer:
         first_probes = outgoing.probe_form_factors.first_of(group.spans)
         if max(first_probes, default=-1) < 0:  # convex bodies send themselves nothing
             return others
-        arguments = outgoing.probe_light, *group.probe_weights, others
-        return self_light(*arguments, body_spans=group.spans, first_probes=first_probes)
+        rows, weights = group.probe_weights
+        return self_light(
+            outgoing.probe_light, rows, weights, others, body_spans=group.spans, first_probes=first_probes
+        )
 
     def _from_planes(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array
@@ -169,10 +171,19 @@ class BounceGatherer:
         # Planes are seen through the middles of cells. Through transmittance.directions, where skylight comes from,
         # which are above horizons, a ball on a ground lost 4% of the ground's light.
         middles = fibonacci(len(transmittance.directions))
-        arguments = fronts.lifted_points, group.normals, transmittance.transmittance_nonplanar, outgoing.frames
-        options = {"front_weights": fronts.front_weights, "self_plane": self_plane, "addend": others}
-        coverages = transmittance.part_coverages
-        return plane_light(*arguments, outgoing.texels, planes.blockers, middles, **options, coverages=coverages)
+        return plane_light(
+            fronts.lifted_points,
+            group.normals,
+            transmittance.transmittance_nonplanar,
+            outgoing.frames,
+            outgoing.texels,
+            planes.blockers,
+            middles,
+            front_weights=fronts.front_weights,
+            self_plane=self_plane,
+            addend=others,
+            coverages=transmittance.part_coverages,
+        )
 
     def _from_spheres(
         self, group: Group, transmittance: CellTransmittance, outgoing: OutgoingRadiance, others: wp.array
@@ -187,10 +198,14 @@ class BounceGatherer:
         geometry = {"geometry": group.points, "proxies": proxies.radii}
         count = common_batch({**geometry, "light": proxy_radiance, "other light": others})
         points, normals = expand(group.points, count), expand(group.normals, count)
-        spheres = expand(proxies.centers, count), expand(proxies.radii, count)
-        is_same = spheres[0] is proxies.centers and spheres[1] is proxies.radii
+        centers, radii = expand(proxies.centers, count), expand(proxies.radii, count)
+        is_same = centers is proxies.centers and radii is proxies.radii
         return sphere_light(
-            *(points, normals, *spheres, proxy_radiance),
+            points,
+            normals,
+            centers,
+            radii,
+            proxy_radiance,
             expand_rows(transmittance.transmittance_nonplanar, count),
             transmittance.transmittance_self,
             transmittance.directions,

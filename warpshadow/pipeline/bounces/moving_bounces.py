@@ -100,10 +100,10 @@ def _patch_weights(senders: Senders, visibility: list[PortionForBounces]) -> Pat
     return find_patch_weights(join_portions(portions), senders.mean, senders.patch_of_sample)
 
 
-def _add_emitted(lit: list[PortionForBounces], emitted: wp.array) -> list[PortionForBounces]:
-    """Add direct light of emitters, vec3 of shape [batch, receiver], to that of portions."""
+def _add_emitted(portions: list[PortionForBounces], emitted: wp.array) -> list[PortionForBounces]:
+    """Add direct light of emitters, vec3 of shape [batch, receiver], to the direct light of portions."""
     result, first = [], 0
-    for portion in lit:
+    for portion in portions:
         end = first + portion.direct.shape[1]
         result.append(portion._replace(direct=add_light(portion.direct, cut(emitted, first, end))))
         first = end
@@ -129,7 +129,7 @@ class Radiosity(Node):
         proxies: Proxies,
         self_form_factors: SelfFormFactors,
         gatherer: BounceGatherer,
-        lit: Node,
+        portions: Node,
         albedo: Node,
         patch_samples: PatchSampleNodes,
     ):
@@ -141,31 +141,32 @@ class Radiosity(Node):
         self._reflection = ExplainRow("radiosity", item_text)
         self._self_reflection = ExplainRow("self light of patches", item_text, idle)
         rows = self._reflection, self._self_reflection, *gatherer.rows
-        super().__init__("", None, lit, albedo, placed_proxies, frames, weights, rows=rows)
+        super().__init__("", None, portions, albedo, placed_proxies, frames, weights, rows=rows)
 
     def compute(self, call: Call) -> OutgoingRadiance:
         """Reflect direct light, then light that has bounced once, and so on; more often between patches of one body."""
-        lit, albedo, placed_proxies, frames, weights = self.values(call)
+        portions, albedo, placed_proxies, frames, weights = self.values(call)
         senders, count = self._proxies.senders, self._count
         self_factors = None  # between patches of one body
         if not self._self_reflection.idle:
-            self_factors = self._self_form_factors.between_patches(senders, [portion.group for portion in lit])
+            self_factors = self._self_form_factors.between_patches(senders, [portion.group for portion in portions])
         if self_factors is not None and self_factors.is_zero:
             self_factors = None
 
         def outgoing_of(radiosity: wp.array) -> OutgoingRadiance:
-            arguments = self._proxies, self._self_form_factors, radiosity
-            return OutgoingRadiance(*arguments, placed_proxies, frames, weights.weights)
+            return OutgoingRadiance(
+                self._proxies, self._self_form_factors, radiosity, placed_proxies, frames, weights.weights
+            )
 
         def radiosity_by_others(radiosity: wp.array | None) -> wp.array:
             """Radiosity of patches by light from the sky and from other bodies."""
             if radiosity is None:
-                portions = [portion.direct for portion in lit]
+                light = [portion.direct for portion in portions]
             else:
                 outgoing = outgoing_of(radiosity)
-                portions = [self._gatherer.add_bounced(self, call, portion, outgoing) for portion in lit]
+                light = [self._gatherer.add_bounced(self, call, portion, outgoing) for portion in portions]
             with self.timed(call, self._reflection):
-                return patch_radiosity(albedo, join_portions(portions), senders.mean, weights.sample_weights)
+                return patch_radiosity(albedo, join_portions(light), senders.mean, weights.sample_weights)
 
         def add_radiosity_by_self(by_others: wp.array, radiosity: wp.array | None) -> wp.array:
             if self_factors is None or radiosity is None:
@@ -202,9 +203,9 @@ class BouncedShading(DirectLightNode):
     def compute(self, call: Call) -> wp.array:
         """Light all portions, directly and by the patches' radiosity."""
         free_light, outgoing = self.values(call)
-        portions = self._visibility.value(call) if self._visibility.caches else self._visibility.portions(call)
-        lit = (self._light(call, portion, free_light) for portion in portions)
-        return join_portions([self._gatherer.add_bounced(self, call, portion, outgoing) for portion in lit])
+        visibility = self._visibility.value(call) if self._visibility.caches else self._visibility.portions(call)
+        portions = (self._light(call, portion, free_light) for portion in visibility)
+        return join_portions([self._gatherer.add_bounced(self, call, portion, outgoing) for portion in portions])
 
 
 class MovingBounces:
@@ -258,15 +259,18 @@ class MovingBounces:
             lambda: self._patch_samples(self._visibility_maker(points, light), proxies, points),
         )
         why_not = "light bounces once" if self._count == 1 else ""
-        arguments = f"{len(senders.sides):,} patch samples", OF_PATCH_SAMPLES
-        lit: Node = patch_samples.visibility
+        item_text = f"{len(senders.sides):,} patch samples"
+        portions: Node = patch_samples.visibility
         if light.is_free:
-            lit = DirectLightNode(patch_samples.visibility, method.projected_light_node(points, light), *arguments)
+            free_light = method.projected_light_node(points, light)
+            portions = DirectLightNode(patch_samples.visibility, free_light, item_text, OF_PATCH_SAMPLES)
         if materials.emission:
-            lit = Node("", _add_emitted, lit, method.cached_emitted_light_node(patch_samples.points, materials))
+            portions = Node(
+                "", _add_emitted, portions, method.cached_emitted_light_node(patch_samples.points, materials)
+            )
         albedo = self._patches.albedo(materials, senders.bodies)
-        gatherer = self._gatherer(senders, *arguments, why_not, only_others=True)
-        return Radiosity(self._count, proxies, self._self_form_factors, gatherer, lit, albedo, patch_samples)
+        gatherer = self._gatherer(senders, item_text, OF_PATCH_SAMPLES, why_not, only_others=True)
+        return Radiosity(self._count, proxies, self._self_form_factors, gatherer, portions, albedo, patch_samples)
 
     def _visibility_maker(self, points: ShadingContext, light: LightInput) -> Callable[..., TransferNode]:
         """Makes nodes of visibility in free light, or of light if it is known."""
@@ -288,8 +292,8 @@ class MovingBounces:
         def project(patch_samples: Receivers, visibility: list[PortionForBounces], *arguments: Any) -> PlacedProxies:
             return proxies.place(patch_samples, [portion.transmittance for portion in visibility], *arguments)
 
-        arguments = senders, points, proxies.nearest_spheres
-        lit_samples = points.cached("patch samples beside proxies", proxies, lambda: lit_patch_samples(*arguments))
+        make_samples = functools.partial(lit_patch_samples, senders, points, proxies.nearest_spheres)
+        lit_samples = points.cached("patch samples beside proxies", proxies, make_samples)
         visibility = make_visibility(lit_samples)
         frames = Node("", planes.blockers.frames if planes else lambda _: None, points.vertices)
         placed_proxies = Node("", project, lit_samples.receivers_node, visibility, spheres, frames)

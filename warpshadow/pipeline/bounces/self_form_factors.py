@@ -59,8 +59,15 @@ class SelfFormFactors:
             if merged_scene.is_two_sided[body]:
                 points, normals = np.tile(points, (2, 1)), np.concatenate([normals, -normals])
             vertices = probes.positions[: len(mesh.positions)]
-            arguments = self._patches.of_body(body), vertices, mesh.surface.faces, points, normals
-            self._of_body[body] = self_form_factors(*arguments, device=merged_scene.device, progress=self._progress)
+            self._of_body[body] = self_form_factors(
+                self._patches.of_body(body),
+                vertices,
+                mesh.surface.faces,
+                points,
+                normals,
+                device=merged_scene.device,
+                progress=self._progress,
+            )
         return self._of_body[body]
 
     def of_senders(self, senders: Senders) -> ProbeFormFactors:
@@ -138,8 +145,8 @@ def self_form_factors(
 
     def trace(_: Unfinished) -> csr_matrix:
         mesh = patch_mesh(patches, positions, faces, device=device)
-        arguments = patches.patch_of_pieces, patches.count, points, normals
-        return trace_form_factors(mesh, *arguments, rays=_RAYS, progress=progress)
+        numbers, count = patches.patch_of_pieces, patches.count
+        return trace_form_factors(mesh, numbers, count, points, normals, rays=_RAYS, progress=progress)
 
     return load_or_compute(
         cache_path("form_factors", key.hexdigest()),

@@ -89,21 +89,24 @@ class StaticBounces:
             )
 
         factors = self._factors(points, materials, senders)
-        arguments = transfers, factors
-        lit = points.cached("patches in each coefficient", transfers, lambda: Node("", light_on_patches, *arguments))
+        make_light = functools.partial(Node, "", light_on_patches, transfers, factors)
+        patch_light = points.cached("patches in each coefficient", transfers, make_light)
         if materials is not points.materials:
-            transfer = points.cached("transfer of patches", lit, lambda: Node("", _as_transfer, lit))
+            make_transfer = functools.partial(Node, "", _as_transfer, patch_light)
+            transfer = points.cached("transfer of patches", patch_light, make_transfer)
             return self._shading(direct, Node("", colored_light, transfer, light), factors, points, materials)
 
         def bounced() -> Node:
-            arguments = self._patches.albedo(materials, senders.bodies), lit, factors
-            find = functools.partial(self._light_at_cache_points, senders=senders)
-            return Node("transfer of bounces", lambda *arguments: _as_transfer(find(*arguments)), *arguments)
+            def find(albedo: wp.array, patch_light: wp.array, factors: StaticFormFactors) -> ColoredTransfer:
+                return _as_transfer(self._light_at_cache_points(albedo, patch_light, factors, senders))
+
+            albedo = self._patches.albedo(materials, senders.bodies)
+            return Node("transfer of bounces", find, albedo, patch_light, factors)
 
         def shade(direct: wp.array, transfer: ColoredTransfer, light: wp.array, factors: StaticFormFactors) -> wp.array:
             return factors.to_receivers(direct, colored_light(transfer, light))
 
-        transfer = points.cached("bounces", lit, bounced)
+        transfer = points.cached("bounces", patch_light, bounced)
         return Node("bounces", shade, direct, transfer, light, factors, items=self._item_text(points, senders))
 
     def _shading(
@@ -126,8 +129,9 @@ class StaticBounces:
     def _radiosity_node(self, patch_light: Node, factors: Node, points: ShadingContext, materials: Materials) -> Node:
         senders = self._patches.senders(materials)
         find = functools.partial(self._find_radiosity, senders=senders)
-        inputs = self._patches.albedo(materials, senders.bodies), patch_light, factors
-        return points.cached("radiosity", (patch_light, materials), lambda: Node("", find, *inputs))
+        albedo = self._patches.albedo(materials, senders.bodies)
+        make = functools.partial(Node, "", find, albedo, patch_light, factors)
+        return points.cached("radiosity", (patch_light, materials), make)
 
     def _light_at_cache_points(
         self, albedo: wp.array, patch_light: wp.array, factors: StaticFormFactors, senders: Senders
@@ -149,8 +153,7 @@ class StaticBounces:
                 albedo, by_others if radiosity is None else multiply(factors.within_bodies, radiosity, addend=by_others)
             )
 
-        arguments = self._bounces, light_of_others, reflect_all, senders.areas
-        return after_bounces(*arguments, self_bounces=SELF_BOUNCES)
+        return after_bounces(self._bounces, light_of_others, reflect_all, senders.areas, self_bounces=SELF_BOUNCES)
 
     def openness(self, points: ShadingContext, materials: Materials, at_patch_samples: Node | None) -> Node | None:
         """Part of the hemispheres of points that no blocker takes, by the rays that find the light of blockers.
@@ -183,14 +186,14 @@ class StaticBounces:
         def make() -> Node:
             patch_samples = self.patch_samples(points, materials)
             find = functools.partial(find_form_factors, senders, is_still=self._is_still, progress=self._progress)
-            skies = [self._openness(item) for item in (patch_samples, points)]
             return Node(
                 "form factors",
                 find,
                 points.vertices,
                 patch_samples.receivers_node,
                 points.receivers_node,
-                *skies,
+                self._openness(patch_samples),
+                self._openness(points),
                 at_patch_samples,
                 None if at_patch_samples is None else self._patches.albedo(materials, senders.bodies),
                 items=lambda: f"{len(senders.sides):,} patch samples × {len(senders.areas):,} patches",
@@ -211,6 +214,6 @@ def _light_on_patches(at_patch_samples: wp.array, factors: StaticFormFactors) ->
     return multiply(factors.patch_sample_means, at_patch_samples)
 
 
-def _as_transfer(lit: wp.array) -> ColoredTransfer:
-    """The matrix of receivers that are lit by each coefficient alone, vec3 of shape [coefficient, receiver]."""
-    return ColoredTransfer.from_lit_receivers(lit.numpy(), device=lit.device)
+def _as_transfer(light: wp.array) -> ColoredTransfer:
+    """The matrix of light that each coefficient alone sends to receivers, vec3 of shape [coefficient, receiver]."""
+    return ColoredTransfer.from_lit_receivers(light.numpy(), device=light.device)

@@ -75,8 +75,8 @@ class CellLobes(LobeVisibility):
             transmittance, receivers.normals, projected_light.cosine_directions
         )
         if projected_light.shell_cells is not None:
-            arguments = receivers.points, receivers.normals, transmittance, projected_light.blocking_directions
-            transfer = projected_light.shell_cells.find_transfer(*arguments)
+            directions, find_transfer = projected_light.blocking_directions, projected_light.shell_cells.find_transfer
+            transfer = find_transfer(receivers.points, receivers.normals, transmittance, directions)
         light = projected_light.coefficients if free is None else change_basis(free, self._method.native_from_basis)
         assert light is not None
         even = wp.full((1, transmittance.shape[2]), wp.vec3(1.0), dtype=wp.vec3, device=diffuse.device)

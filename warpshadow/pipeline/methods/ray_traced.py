@@ -63,8 +63,8 @@ class RayTraced(Method):
         from warpshadow.pipeline.methods.paths import path_traced
 
         emitters = self.emitters.samples_node(points) if self.merged_scene.has_beams else None
-        arguments = direct, self._meshes(points), points, light, self.shell_of(light), materials, emitters
-        return path_traced(*arguments, samples=self._sample_count, progress=self.progress)
+        trace = functools.partial(path_traced, samples=self._sample_count, progress=self.progress)
+        return trace(direct, self._meshes(points), points, light, self.shell_of(light), materials, emitters)
 
     def emitted_light_node(self, points: ShadingContext, materials: Materials) -> Node:
         """Direct light of emitters on points, by rays to their samples. Differentiable: emission."""
@@ -82,8 +82,8 @@ class RayTraced(Method):
 
         def traced() -> Node:
             name, items = f"rays to emitters{points.suffix}", functools.partial(receiver_text, points.weak_reference)
-            arguments = points.vertices, receivers, samples
-            return Node(name, self._trace_emitters, *arguments, items=items, has_adjoint=False)
+            trace = self._trace_emitters
+            return Node(name, trace, points.vertices, receivers, samples, items=items, has_adjoint=False)
 
         transmittance = points.cached("rays to emitters", None, traced)
         return receivers, samples, self.emitters.radiance(materials), transmittance
@@ -95,14 +95,13 @@ class RayTraced(Method):
         from warpshadow.pipeline.shading.emitted_light import trace_transmittances
         from warpshadow.stages.emitters.samples import SAMPLES
 
-        lit, samples = (_checked_points(receivers.points), receivers.normals), self.emitters.samples
+        points, normals, samples = _checked_points(receivers.points), receivers.normals, self.emitters.samples
+        trace = functools.partial(trace_transmittances, progress=self.progress)
         rays = max(1, (self.visibility.ray_count if self.shares_directions else self._sample_count) // (4 * SAMPLES))
         meshes = [self.merged_scene.blocker_mesh(positions[instance]) for instance in range(len(positions))]
         pairs = zip(samples.spans(), self.emitters.ray_counts(placed_samples, rays), strict=True)
         return [
-            trace_transmittances(
-                meshes, *lit, samples, positions, placed_samples, span, rays=counts, progress=self.progress
-            )
+            trace(meshes, points, normals, samples, positions, placed_samples, span, rays=counts)
             for span, counts in pairs
         ]
 
@@ -171,8 +170,8 @@ class RayTraced(Method):
         points, shells = _checked_points(receivers.points), _shells(receivers, shell)
         samples = sample_map(light.radiance, self._sample_count)
         traced = wp.empty(_batch_shape(points, shells), dtype=wp.vec3, device=points.device)
-        batches = traced, meshes, points, receivers.normals, shells
-        for result, mesh, origins, normals, instance_shell in _instances(*batches):
+        instances = _instances(traced, meshes, points, receivers.normals, shells)
+        for result, mesh, origins, normals, instance_shell in instances:
             wp.copy(
                 result, trace_shading(mesh, origins, normals, samples, shell=instance_shell, progress=self.progress)
             )
@@ -185,20 +184,18 @@ class RayTraced(Method):
         points, shells = _checked_points(receivers.points), _shells(receivers, shell)
         count = -(-self.visibility.ray_count // PACKET) * PACKET
         traced = wp.empty(_batch_shape(points, shells), dtype=wp.vec3, device=points.device)
-        batches = traced, trees, points, receivers.normals, shells
-        for instance, (result, tree, origins, normals, instance_shell) in enumerate(_instances(*batches)):
-            arguments, options = (tree, origins, normals), {"shell": instance_shell}
+        instances = _instances(traced, trees, points, receivers.normals, shells)
+        for instance, (result, tree, origins, normals, instance_shell) in enumerate(instances):
             # a ratio image has the same directions with the bodies and without
-            share_finder = (
-                None
-                if self.merged_scene.scene.catchers
-                else functools.partial(find_light_shares, *arguments, **options)
-            )
+            share_finder = None
+            if not self.merged_scene.scene.catchers:
+                share_finder = functools.partial(find_light_shares, tree, origins, normals, shell=instance_shell)
             samples = cut_map(light.radiance, count, share_finder)
             corners = None
             if receivers.fragments.face_ids.ndim == 3:  # of an image
                 corners = find_corners(receivers, instance, self.merged_scene.scene.supersampling)
-            wp.copy(result, trace_shared(*arguments, samples, corners=corners, progress=self.progress, **options))
+            trace = functools.partial(trace_shared, shell=instance_shell, progress=self.progress)
+            wp.copy(result, trace(tree, origins, normals, samples, corners=corners))
         return traced
 
     def _transfer(self, meshes: Meshes, receivers: Receivers, shell: wp.array | None = None) -> list[wp.array]:
@@ -208,10 +205,10 @@ class RayTraced(Method):
         functions, count = self.basis.functions, self.visibility.ray_count
         if isinstance(self.basis, CellBasis):
             functions, count = self.basis.balanced_functions, max(count, _RAYS_OF_CELL * self.basis.size)
-        batches = transfer, meshes, points, receivers.normals, shells
-        for result, mesh, origins, normals, instance_shell in _instances(*batches):
-            options = {"shell": instance_shell, "progress": self.progress}
-            wp.copy(result, trace_transfer(mesh, origins, normals, functions, count, **options))
+        trace = functools.partial(trace_transfer, progress=self.progress)
+        instances = _instances(transfer, meshes, points, receivers.normals, shells)
+        for result, mesh, origins, normals, instance_shell in instances:
+            wp.copy(result, trace(mesh, origins, normals, functions, count, shell=instance_shell))
         return [transfer]
 
 
@@ -227,10 +224,9 @@ class TracedLobes(LobeVisibility):
 
     def transmittance(self, lobes: LitLobes, directions: Node) -> Node:
         """Transmittance towards the samples of lobes."""
-        points = lobes.points
-        arguments = self._method.trees_around(points), points.receivers_node, directions
-        item_text = functools.partial(receiver_text, points.weak_reference)
-        return Node("transmittance of lobes", _trace_lobes, *arguments, items=item_text)
+        trees, receivers = self._method.trees_around(lobes.points), lobes.points.receivers_node
+        item_text = functools.partial(receiver_text, lobes.points.weak_reference)
+        return Node("transmittance of lobes", _trace_lobes, trees, receivers, directions, items=item_text)
 
     def blocked_radiance(self, lobes: LitLobes, diffuse: Node, openness: Node | None) -> Node:
         """Mean radiance of the blockers of receivers, by their light with bounces and without."""
@@ -245,8 +241,9 @@ class TracedLobes(LobeVisibility):
 def _trace_lobes(trees: list[FaceTree], receivers: Receivers, directions: wp.array) -> wp.array:
     points = _checked_points(receivers.points)
     traced = wp.empty(directions.shape, dtype=wp.float32, device=points.device)
-    for result, *arguments in _instances(traced, trees, points, receivers.normals, directions):
-        wp.copy(result, trace_lobes(*arguments))
+    instances = _instances(traced, trees, points, receivers.normals, directions)
+    for result, tree, origins, normals, samples in instances:
+        wp.copy(result, trace_lobes(tree, origins, normals, samples))
     return traced
 
 

@@ -47,7 +47,7 @@ class ReceiverCount(NamedTuple):
 
 
 class ShadingContext:
-    """Receivers, such as those of a view, and all that their shading depends on but the light and the method.
+    """Receivers, such as a view's, and all that their shading depends on but the light and the method.
 
     PBRT calls such records contexts.
 

@@ -83,7 +83,7 @@ class SceneEmitters:
         )
 
     def _over_all_vertices(self, weights: Sequence[np.ndarray | csr_matrix]) -> SparseMatrix:
-        """Weights of all vertices of the scene, given those of each emitter's, [row, vertex]."""
+        """Weights of all vertices of the scene, given weights of each emitter's, [row, vertex]."""
         from scipy.sparse import block_diag, csr_matrix
 
         merged_scene, matrix = self._merged_scene, block_diag(weights, format="csr")

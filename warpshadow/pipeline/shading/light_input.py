@@ -27,7 +27,7 @@ class LightInput(Input):
 
     @property
     def shell_count(self) -> int:
-        """Number of given shells, one or one for each image; 0 for that of the scene, or none."""
+        """Number of given shells, one or one for each image; 0 for the scene's shell, or none."""
         return 0 if self.shell is None else len(self.shell.value())
 
     @property

@@ -179,7 +179,7 @@ class Method(abc.ABC):
         return points.cached(name, light, make)
 
     def direct_shading_node(self, points: ShadingContext, light: LightInput) -> Node:
-        """Direct light that points reflect as white surfaces, without that of emitters, vec3 [batch, receiver].
+        """Direct light that points reflect as white surfaces, without light of emitters, vec3 [batch, receiver].
 
         Known light is shaded at once; free light meets transfer vectors, which are cached.
         """

@@ -208,7 +208,7 @@ def self_visibility_node(
 def self_lookup_node(
     method: VisibilitySteps, blocker_kinds: BlockerKinds, projected_light: Node | ProjectedLight
 ) -> Node:
-    """Node of the self-visibility lookups of those bodies whose rays are traced."""
+    """Node of the self-visibility lookups of bodies whose rays are traced."""
     bodies, rotations, blockers = blocker_kinds.self_traced, blocker_kinds.rotations, method.scene_blockers
     curved_bodies = [body for body in bodies if not method.merged_scene.is_flat[body]]
     if not curved_bodies or rotations is None:

@@ -35,7 +35,7 @@ class ProjectedLight(Protocol):
 
     @property
     def coefficients(self) -> wp.array | None:
-        """Of known or given light, vec3 of shape [batch, coefficient]; of light from a shell, those of its patches."""
+        """Of known or given light, vec3 of shape [batch, coefficient]; of light from a shell, its patches'."""
 
     def with_coefficients(self: Projected, coefficients: wp.array) -> Projected:
         """Light of the same basis."""

@@ -335,7 +335,7 @@ class View(ShadingContext):
         return other.cached("in another scene", self, lambda: self.with_receivers(other.receivers_node))
 
     def _radiance(self, shading: Node, reflectance: Node, materials: Materials | None = None) -> Node:
-        """Node of the samples; given materials, the reflectance is that of surfaces, with which it moves."""
+        """Node of the samples; given materials, the reflectance belongs to surfaces, with which it moves."""
         make_node = functools.partial(Node, "radiance", items=self._sample_text, caches=False)
         if self._is_moving:
             is_near_outline = None if materials is None else self._fragments_of_patterns(materials)[1]

@@ -143,7 +143,7 @@ def make_joint_functions(lanes: int) -> JointFunctions:
 
     @wp.func(inline=True)
     def blocker_adjoint(sums: SumsOfBlockers, adj: SumsOfBlockers, coverage: Coverages):
-        """Gradient of the coverage by one blocker, given those of the sums; 0 where that covers all or nothing."""
+        """Gradient of the coverage by one blocker, given the sums' gradients; 0 where it covers all or nothing."""
         cell_share = coverage.cell_share
         open_share = Lane(1.0) - cell_share
         is_partial = wp.cw_mul(is_positive(cell_share), is_positive(open_share))

@@ -185,7 +185,7 @@ def make_bound_functions(lanes: int) -> BoundFunctions:
 
     @wp.func(inline=True)
     def reaches_bundle(bound: PartBound, axis: wp.vec3, half_angle: wp.vec2):
-        """Whether the cone around a part reaches that of a bundle."""
+        """Whether the cone around a part reaches the cone of a bundle."""
         # as far as π together, else all does
         cosine = half_angle[0] * bound.cosine - half_angle[1] * bound.sine
         sine = half_angle[0] * bound.sine + half_angle[1] * bound.cosine

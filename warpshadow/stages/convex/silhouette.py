@@ -277,7 +277,7 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
         first: int,
         gradients: wp.array(dtype=Lane),
     ):
-        """Replace the gradient of an edge's normal by those of its ends."""
+        """Replace the gradient of an edge's normal by gradients of its ends."""
         ...
 
     @wp.func(inline=True)
@@ -366,7 +366,7 @@ def make_silhouette_functions(lanes: int) -> SilhouetteFunctions:
     def silhouette_adjoint(
         parts: ConvexArrays, silhouette: Silhouette, instance: int, adj_corners: wp.array2d(dtype=wp.vec3)
     ):
-        """Add to the gradients of corners; returns those of the receivers."""
+        """Add to the gradients of corners; returns the receivers' gradients."""
         adj_points = Vectors()
         for k in range(silhouette.count):
             edge = parts.edges[silhouette.numbers[k]]

@@ -136,7 +136,7 @@ def _blocked_share(parts: PlacedPartArrays, part: int, beam: Beam):
 def _blocked_share_adjoint(
     parts: PlacedPartArrays, part: int, beam: Beam, adj_share: float, batch: int, adj_corners: wp.array2d(dtype=wp.vec3)
 ):
-    """Gradients of the beam, given that of the share; those of corners are added."""
+    """Gradients of the beam, given the share's gradient; gradients of corners are added."""
     adj = Beam()
     border = _nearest_border(parts, part, beam)
     if border.is_any:

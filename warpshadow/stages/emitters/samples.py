@@ -132,7 +132,7 @@ def find_sample_weights(
 
 
 def _pieces_of_samples(labels: np.ndarray, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pieces sorted by sample, and where those of each begin, given the patch of each piece and of each sample."""
+    """Pieces sorted by sample, and where each sample's begin, given the patch of each piece and of each sample."""
     permutation = np.argsort(labels, kind="stable")
     starts = np.searchsorted(labels[permutation], np.arange(int(labels.max(initial=-1)) + 2))
     spans = [permutation[starts[patch] : starts[patch + 1]] for patch in chosen]
@@ -184,7 +184,7 @@ class EmitterBeams(NamedTuple):
 
 
 class EmitterSpan(NamedTuple):
-    """Samples of one emitter among those of all."""
+    """Samples of one emitter among all samples."""
 
     emitter: int  # its number among the emitters
     first: int  # of the samples
@@ -327,7 +327,7 @@ def sample_radius(area: wp.vec3):
 
 @wp.func
 def facing_area(beam: wp.vec3, area: wp.vec3, softness: float, is_two_sided: int):
-    """Area of a sample that a receiver sees, times the length of the way to it: that of its front, or of both sides."""
+    """Area of a sample that a receiver sees, of its front or of both sides, times the length of the way to it."""
     facing = -wp.dot(beam, area)
     width = softness * wp.length(area) * wp.length(beam)
     area_seen = _soft_positive(facing, width)

@@ -28,7 +28,7 @@ wp.set_module_options({"max_unroll": 1})
 
 
 def beam_of(angles: Sequence[float] | None) -> tuple[float, float]:
-    """The beam of inner and outer angles [degrees]; that of all directions for None."""
+    """The beam of inner and outer angles [degrees]; all directions for None."""
     if angles is None:
         return EVERYWHERE
     inner, outer = (1 - np.cos(np.radians(angles))).tolist()

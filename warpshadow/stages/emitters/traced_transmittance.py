@@ -27,7 +27,7 @@ from warpshadow.stages.textures.sample import interpolate_uv
 _SEED = 43
 
 _GOLDEN_SHARE = (5**0.5 - 1) / 2
-"""Part of a sample's points by which the first ray to the next sample goes further, so that those to near samples
+"""Part of a sample's points by which the first ray to the next sample goes further, so that rays to near samples
 differ."""
 
 _POWER_POINTS = 64  # of a face, at which its texture tells how often it is drawn

@@ -18,7 +18,7 @@ _COST, _ADJOINT_COST = 60.0, 110.0  # nanoseconds that a vertex of six faces tak
 
 @dataclass(frozen=True, eq=False)
 class OneRings:
-    """The faces around each vertex, those of lower index first."""
+    """The faces around each vertex, lower indices first."""
 
     starts: wp.array  # where the faces of each vertex begin, and the end of the last, int32 of shape [vertex + 1]
     faces: wp.array  # vertex indices of each, vec3i

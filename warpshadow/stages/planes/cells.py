@@ -125,7 +125,7 @@ def find_local_receiver_adjoint(
     instance: int,
     adj_frames: wp.array2d(dtype=wp.vec3),
 ):
-    """Add to the gradients of the frames of an instance; returns that of the point."""
+    """Add to the gradients of the frames of an instance; returns the point's gradient."""
     scale_u = wp.length(frames[3 * plane + 1])
     scale_v = wp.length(frames[3 * plane + 2])
     if not (scale_u > 0.0 and scale_v > 0.0):
@@ -173,7 +173,7 @@ def front_of_adjoint(
     plane: int,
     adj_front_weights: wp.array3d(dtype=wp.float32),
 ):
-    """Add to the gradient of the front weights, or return that of the height where there are none."""
+    """Add to the gradient of the front weights, or return the height's gradient where there are none."""
     if front_weights:
         if adj_front_weights:
             adj_front_weights[batch, receiver, plane] = adj_front_weights[batch, receiver, plane] + adj_front
@@ -264,7 +264,7 @@ class MipFootprint:
 
 @wp.func
 def is_covered_by_texels(grid: PlaneGrid):
-    """Whether the covered share of a footprint is that of its texels."""
+    """Whether the covered share of a footprint is found from its texels."""
     return grid.is_covered_by_texels == 1
 
 

@@ -1,4 +1,4 @@
-"""Face texels: radiosity at points of faces, of flat bodies from their grids, of others that of the side of the face.
+"""Face texels: radiosity at points of faces, of flat bodies from their grids, of others from the side of the face.
 
 Faces of flat bodies may be as large as a room, and the shadows on them much smaller. A point with barycentrics w of a
 face in a plane is at Σ w (a, b) in the axes of its grid (:mod:`.grid`), and has the bilinear radiosity of its texels
@@ -63,7 +63,7 @@ def no_face_texels(device: wp.DeviceLike) -> FaceTexels:
 def radiosity_at(
     radiosity: wp.array(dtype=wp.vec3), texels: FaceTexels, faces: wp.array(dtype=wp.vec3i), side: int, weights: wp.vec3
 ):
-    """Radiosity at a point of a side of a face, of that of all texels, and after them of all sides of faces."""
+    """Radiosity at a point of a side of a face, from all texels and, after them, all sides of faces."""
     face_count = texels.plane_of_face.shape[0]
     result = radiosity[radiosity.shape[0] - faces.shape[0] + side]
     if face_count > 0:

@@ -184,7 +184,7 @@ def coverage_of_light(
     front_weights: wp.array | None = None,
     self_plane: int | None = None,
 ) -> wp.array:
-    """Coverage of the light of cells, C′: more exact than that of cells where planes cover them in part.
+    """Coverage of the light of cells, C′: more exact than coverage of cells where planes cover them in part.
 
     Args:
         points, frames, planes, directions, horizon_normals, front_weights, self_plane: As for

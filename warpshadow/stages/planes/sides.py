@@ -143,7 +143,7 @@ def _side_adjoint(
     adj_direction: wp.vec3,
     adj_local_receiver: LocalReceiver,
 ):
-    """Add the gradients of :func:`_position_on_side` and :func:`_direction_on_side` to that of the local receiver."""
+    """Add the gradients of :func:`_position_on_side` and :func:`_direction_on_side` to the local receiver's."""
     sign = wp.where(side.is_back, -1.0, 1.0)
     height_slope = wp.clamp(0.5 * sign * side.local_receiver.position[2] / side.grid.margin, 0.0, 1.0)
     result = LocalReceiver()
@@ -342,7 +342,7 @@ def footprint_on_side_adjoint(
     adj_mip: wp.vec3,
     sides: wp.array(dtype=StoredSide),
 ):
-    """Add the gradients of :func:`.cells.fetch` to those of the local receiver; return that of the direction."""
+    """Add the gradients of :func:`.cells.fetch` to the local receiver's; return the direction's."""
     adj_cosine = -0.5 * footprint.per_cosine * adj_mip[2]  # texels are as wide as t / √c′
     adj_distance = float(0.0)
     if adj_mip[2] != 0.0:

@@ -269,7 +269,7 @@ def _make_traverse(meet_face: str, result: str, result_type: type) -> wp.Functio
         facing_rays: wp.int32,
         last_face: int,
     ) -> result_type:
-        """The fields of a tree, a receiver, the rays, bits of those to trace, a face that is met first; −1 for none."""
+        """The fields of a tree, a receiver, the rays, bits of rays to trace, a face that is met first; −1 for none."""
         ...
 
     return traverse

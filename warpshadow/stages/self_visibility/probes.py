@@ -27,7 +27,7 @@ from warpshadow.stages.receivers.body_spans import (
 )
 
 _EVEN_FACES = 10_000
-"""Edges are judged by those of an even cut of the surface into so many faces (507 vertices alone lose 3.5%)."""
+"""Edges are judged by the edges of an even cut of the surface into so many faces (507 vertices alone lose 3.5%)."""
 
 _MAX_SAMPLE_EDGE = 1.2  # longest edge where samples receive, in edges of the even cut
 
@@ -36,7 +36,7 @@ _MAX_VERTEX_EDGE = 4.0  # likewise where only vertices receive; probes between t
 _SLIVER_RATIO = 3.0  # there an edge is cut only if it is longer than 3 × the ⅓-quantile of edges: those of slivers
 
 _ENTRY_RATIO = 1 / 3
-"""Longest edge that enters another part of the body, as a spoke a hub, over that of others (demos/kinds.py, cage, and
+"""Longest edge that enters another part of the body, as a spoke a hub, over other edges' (demos/kinds.py, cage, and
 chair, wheel and fence: 7.1 and 5.1% off; with 1: 7.5 and 5.5%; with 1/8 probes elsewhere are missing)."""
 
 _MAX_PROBES = 2**14  # probes of a body at most, as long as it has fewer than half as many vertices

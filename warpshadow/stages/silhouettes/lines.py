@@ -61,7 +61,7 @@ def edge_line(edge: wp.vec2i, position: wp.vec2, clip_positions: wp.array(dtype=
 def edge_position_adjoint(
     edge: wp.vec2i, center: wp.vec2, axis: int, adj_position: float, clip_positions: wp.array(dtype=wp.vec4)
 ):
-    """Gradients of an edge's ends, by that of its point's place in the row (axis 0) or column (1) of a position."""
+    """Gradients of an edge's ends, by its point's gradient along the row (axis 0) or column (1) of a position."""
     line = edge_line(edge, center, clip_positions)
     offset_a = relative_to_ray(clip_positions[edge[0]], center)[1 - axis]
     offset_b = relative_to_ray(clip_positions[edge[1]], center)[1 - axis]

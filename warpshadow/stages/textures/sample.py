@@ -99,7 +99,7 @@ def _repeated(texel: int, count: int):
 
 @wp.func
 def _cell(level: wp.vec3i, x: float, y: float):
-    """Find the texels around a position in a level, that of `_texel_position` or one beside it."""
+    """Find the texels around a position in a level, the level of `_texel_position` or one beside it."""
     cell = _Cell()
     cell.s = x - wp.floor(x)
     cell.t = y - wp.floor(y)
@@ -357,7 +357,7 @@ def _sample_adjoint_by_coordinates(
 def sample_albedo(
     fragments: Fragments, faces: wp.array, vertex_albedo: wp.array, textures: Textures, footprints: Footprints
 ) -> wp.array:
-    """Find the reflectance that each sample sees: that of its texture, or of the vertices where there is none.
+    """Find the reflectance that each sample sees: of its texture, or of the vertices where there is none.
 
     It is a continuous function of the footprint: levels blend, and probes fade in at the ends of their line.
 

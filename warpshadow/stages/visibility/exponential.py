@@ -52,7 +52,7 @@ MIN_THRESHOLD = 0.01  # squarings amplify float32 rounding 2^p times; below this
 MAX_SQUARINGS = 20  # limit of the squarings; a log that asks for more is cut down to it
 
 BLEND_END = 0.7
-"""|f̂| / 2^p, in thresholds, from which on the base approximation is wholly the square of that of half the log."""
+"""|f̂| / 2^p, in thresholds, from which on the base approximation is the square of half the log's."""
 
 _SQUARING_COST = 0.5  # nanoseconds that exponentiation takes for a receiver and a pair of coefficients
 

@@ -41,7 +41,7 @@ _MAX_DISTANCE2 = 1.0e30  # (D/E)² is kept where its products are float32
 
 
 class ClusterNodes(NamedTuple):
-    """Spheres and, after them, those of their clusters, if there are any."""
+    """Spheres and, after them, spheres of their clusters, if there are any."""
 
     centers: wp.array  # [batch, node] vec3
     radii: wp.array  # [batch, node] float32
@@ -187,7 +187,7 @@ class Gradients:
 
 @functools.cache
 def make_add_to_node(lanes: int) -> wp.Function:
-    """Make the kernel function that adds the gradients of a block to those of a node."""
+    """Make the kernel function that adds the gradients of a block to a node's."""
     Lane, Vectors = lane_type(lanes), vectors_type(lanes)
     total = make_lane_functions(lanes).total
 
