@@ -907,6 +907,13 @@ def test_gradients_of_the_radiosity_of_mirrored_planes_are_exact(double, planes,
     check(mix, (wp.vec3d, random(4, 1, texel_count + 8, 3)))
 
 
+def test_gradients_of_total_reflectance_are_exact(double, check):
+    """Of a batch of colors and one of gloss."""
+    total = double("stages.gloss.total_reflectance").total_reflectance
+    values = [0.5 + 0.3 * np.tanh(random(seed, 1 + (seed == 0), 4, 3)) for seed in range(4)]
+    check(total, *((wp.vec3d, array) for array in values))
+
+
 def test_gradients_of_radiance_of_blockers_are_exact(double, device, check):
     blocked = double("stages.gloss.reflection").find_blocked_radiance
     direct, openness = random(0, 1, 3, 3), np.repeat(np.linspace(0, 0.9, 3)[None, :, None], 3, axis=2)

@@ -54,6 +54,9 @@ POST = ws.Body(
 )
 
 
+GROUND_ROWS = slice(25, 32)  # of images of :func:`scene_of`, which show nothing else
+
+
 def scene_of(*bodies, **options):
     camera = ws.Camera.look_at((0.5, 2.2, 4.6), (0, 0.9, 0), size=(32, 32))
     return ws.Scene(bodies or (BALL, GROUND, POST), SKY, camera, supersampling=1, **options)
@@ -411,6 +414,32 @@ def test_a_metal_shows_what_a_metal_in_it_mirrors(render):
     image = render(ws.Scene([*balls, *mirrors], ws.EnvironmentMap.constant(1.0), camera, bounces=1))[..., :3]
     red, _, blue = image.mean(axis=(0, 1))
     assert red > 3 * blue
+
+
+@pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render(), by_paths])
+def test_a_black_body_that_shines_lights_the_ground_as_a_gray_one_of_its_total_reflectance(render):
+    """Of 7.3% at roughness 0.3."""
+    black, gray, dull = (
+        dataclasses.replace(BALL, albedo=(albedo,) * 3, specular=specular, roughness=0.3, metallic=0.0)
+        for albedo, specular in ((0.0, 1.0), (0.073, 0.0), (0.0, 0.0))
+    )
+    scenes = [scene_of(ball, GROUND, bounces=1) for ball in (black, gray, dull)]
+    of_black, of_gray, of_dull = (render(scene)[GROUND_ROWS] for scene in scenes)
+    brighter = (of_gray - of_dull).max()
+    assert brighter > 0.01 * of_dull.max()
+    np.testing.assert_allclose(of_black, of_gray, atol=0.02 * brighter)
+
+
+@pytest.mark.parametrize("name", ["roughness", "metallic", "specular", "albedo"])
+def test_gradients_to_a_body_that_lights_a_ground_agree_with_differences(name):
+    scene = scene_of(bounces=1)
+    renderer, image = TorchRenderer(scene, progress=False), weights()
+
+    def loss(value):
+        return (renderer(**{name: {"ball": value}}) * image)[0, GROUND_ROWS].sum()
+
+    gradient, difference = twins.slopes(loss, torch.full((1, 3) if name == "albedo" else (1,), 0.6), 3e-2)
+    assert gradient == pytest.approx(difference, rel=SMOOTH)
 
 
 @pytest.mark.parametrize("render", [ws.render, lambda scene: ws.Renderer(scene).render(), by_paths])

@@ -147,6 +147,10 @@ class Materials:
             arrays["emission"] = [array(np.atleast_2d(colors)) for colors in emission]
         return cls(merged_scene, {name: Input(name, values) for name, values in arrays.items()})
 
+    def input_of(self, name: str) -> Input:
+        """The arrays of each body, by name, as given."""
+        return self._inputs[name]
+
     @property
     def have_patterns(self) -> bool:
         """Whether a body has several colors: of its vertices, or of a texture."""
@@ -154,7 +158,9 @@ class Materials:
         return any(array.shape[1:] != (1,) for arrays in sources for array in arrays if array is not None)
 
     def is_black(self, number: int) -> bool:
-        """Whether a body is known to reflect nothing: it is black in the scene, and nothing is given in place of it."""
+        """Whether a body is known to reflect nothing: black in the scene, without gloss, and no color is given."""
+        if self.merged_scene.is_glossy[number]:
+            return False
         for name in ("albedo", "textures"):
             if self._inputs[name].value()[number] is not self._of_scene[name].value()[number]:
                 return False
@@ -268,7 +274,7 @@ def _arrays_of(replacements: Mapping[str, BodyArrays]) -> Iterator[tuple[str, in
 
 
 def _of_bodies(merged_scene: MergedScene, name: str) -> list[wp.array | None]:
-    """Roughness or the like of each body, float32 of shape [1, 1], [1, vertex] or [1, height, width]."""
-    values = (getattr(body, name) for body in merged_scene.scene.bodies)
-    rows = [GLOSS_DEFAULTS[name] if value is None else value for value in values]
+    """Roughness or the like of each body, 0 without gloss: float32 [1, 1], [1, vertex] or [1, height, width]."""
+    values = ((body.is_glossy, getattr(body, name)) for body in merged_scene.scene.bodies)
+    rows = [is_glossy * GLOSS_DEFAULTS[name] if value is None else value for is_glossy, value in values]
     return [wp.array(np.atleast_1d(row)[None], dtype=wp.float32, device=merged_scene.device) for row in rows]

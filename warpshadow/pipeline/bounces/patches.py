@@ -28,6 +28,7 @@ from warpshadow.stages.planes.face_texels import FaceTexels, find_face_texels, n
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
 from warpshadow.stages.receivers.find import Receivers, receivers_on_faces
 from warpshadow.stages.sparse import SparseMatrix, multiply
+from warpshadow.stages.textures.numbers import as_colors
 
 _MIN_PATCHES = 128
 """Patches of a body of few faces, which may have as many sides as stairs. With 32 in place of 128 images of stairs with
@@ -158,7 +159,7 @@ class ScenePatches:
     # ------------------------------------------------------------------------------------------ albedo
 
     def albedo(self, materials: Materials, bodies: tuple[int, ...]) -> Node:
-        """Node of the mean reflectance of the patches of some bodies, vec3 of shape [batch, patch].
+        """Node of the mean reflectance of the patches of some bodies, of gloss with it, vec3 of shape [batch, patch].
 
         It is cached for as long as the materials live: that of the scene's is computed once.
         """
@@ -168,21 +169,37 @@ class ScenePatches:
         return nodes[bodies]
 
     def _make_albedo(self, materials: Materials, bodies: tuple[int, ...]) -> Node:
-        counts = [self.of_body(number).count for number in bodies]
+        items = f"{sum(self.of_body(number).count for number in bodies):,} patches"
+        means = functools.partial(self._means_of_patches, bodies, bodies)
+        albedo = Node("patch albedo", means, materials.albedo, materials.textures, items=items)
+        glossy_bodies = [number for number in bodies if self.merged_scene.is_glossy[number]]
+        if not glossy_bodies:
+            return albedo
+        from warpshadow.stages.gloss.total_reflectance import total_reflectance
 
-        def means(colors: Sequence[wp.array], images: Sequence[wp.array | None]) -> wp.array:
-            reflectance = {n: colors[n] if images[n] is None else rows(images[n]) for n in bodies}
-            total = None
-            # so only varying inputs have an adjoint
-            for number in sorted(bodies, key=lambda n: reflectance[n].requires_grad):
-                image = images[number]
-                mean = self._mean(
-                    number, bodies, reflectance[number].shape[1], None if image is None else image.shape[1:]
-                )
-                total = multiply(mean, reflectance[number], addend=total)
-            return total
+        means = functools.partial(self._means_of_patches, glossy_bodies, bodies)
+        gloss = [Node("", means, materials.input_of(name)) for name in ("roughness", "metallic", "specular")]
+        return Node("", total_reflectance, albedo, *gloss)
 
-        return Node("patch albedo", means, materials.albedo, materials.textures, items=f"{sum(counts):,} patches")
+    def _means_of_patches(
+        self,
+        numbers: Sequence[int],
+        bodies: tuple[int, ...],
+        values: Sequence[wp.array],
+        textures: Sequence[wp.array | None] | None = None,
+    ) -> wp.array:
+        """Means of some of the bodies' colors or numbers over the patches of all of them, where others have 0."""
+        pairs = zip(values, textures or [None] * len(values), strict=True)
+        all_arrays = [value if texture is None else texture for value, texture in pairs]
+        arrays = {number: all_arrays[number] for number in numbers}
+        total = None
+        # so only varying inputs have an adjoint
+        for number in sorted(numbers, key=lambda n: arrays[n].requires_grad):
+            array = as_colors(arrays[number])
+            size = array.shape[1:] if array.ndim == 3 else None
+            colors = array if size is None else rows(array)
+            total = multiply(self._mean(number, bodies, colors.shape[1], size), colors, addend=total)
+        return total
 
     def _mean(self, number: int, bodies: Sequence[int], color_count: int, size: tuple[int, int] | None) -> SparseMatrix:
         """Weights of a body's colors in the patches of some bodies, [patch, color]; of its texels if it has a size."""

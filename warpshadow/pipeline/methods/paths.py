@@ -17,6 +17,7 @@ from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.ray_traced.path_tracing import PathSurfaces, trace_bounces
 from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.shell.shell_rays import FAR
+from warpshadow.stages.textures.numbers import as_colors
 from warpshadow.stages.textures.pyramid import Textures
 
 if TYPE_CHECKING:  # it is imported where bodies emit
@@ -131,7 +132,7 @@ def path_traced(
         points.normals,
         light,
         shell,
-        materials.vertex_albedo,
+        _vertex_reflectance(materials),
         colors.pyramids if colors.images else None,
         materials.of_vertices("emission") if materials.emission else None,
         emission_images.pyramids if emission_images and emission_images.images else None,
@@ -145,3 +146,16 @@ def _whole_mesh(merged_scene: MergedScene, casting: wp.Mesh | None, positions: w
     """The mesh of all bodies: the mesh of shadow casters if that is all of them."""
     is_whole = casting is not None and len(merged_scene.shadow_casters) == len(merged_scene.scene.bodies)
     return casting if is_whole else merged_scene.mesh(positions)
+
+
+def _vertex_reflectance(materials: Materials) -> Node:
+    """Node of the reflectance of vertices, gloss included, vec3 of shape [batch, vertex]; textures count without it."""
+    if not materials.roughness:
+        return materials.vertex_albedo
+    from warpshadow.stages.gloss.total_reflectance import total_reflectance
+
+    def find(albedo: wp.array, *gloss: wp.array) -> wp.array:
+        return total_reflectance(albedo, *map(as_colors, gloss))
+
+    gloss = (materials.of_vertices(name) for name in ("roughness", "metallic", "specular"))
+    return Node("", find, materials.vertex_albedo, *gloss)
