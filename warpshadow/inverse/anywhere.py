@@ -1,4 +1,4 @@
-"""Poses of which nothing is known: bodies turned any way, where targets differ from images without them."""
+"""Starts of a search for unknown poses: bodies turned any way, where targets differ from images without them."""
 
 from collections.abc import Mapping
 
