@@ -36,7 +36,7 @@ from warpshadow.inverse import (
 )
 from warpshadow.inverse.descent import CONVERGENCE_WINDOW
 from warpshadow.inverse.model import Model
-from warpshadow.inverse.schedule import check_stages, deformation_stages, pose_stages
+from warpshadow.inverse.schedule import check_stages, deformation_stages, pose_stages, unknown_pose_stages
 from warpshadow.torch import rotation_matrices
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -328,7 +328,7 @@ def test_the_stages_for_poses_and_deformations_suit_every_size(size):
     """Also one of which 1 / 49 is a part, though 49 · (1 / 49) is not 1 in floating point."""
     width, height = size
     problem = Problem(small_scene(size=size), Target(np.ones((height, width, 3))), Pose(0))
-    for stages in (pose_stages(problem), deformation_stages(problem)):
+    for stages in (pose_stages(problem), unknown_pose_stages(problem), deformation_stages(problem)):
         check_stages(stages, problem)
         sizes = [stage.scale * min(size) for stage in stages]
         assert sizes == sorted(sizes)

@@ -1,4 +1,4 @@
-"""Random start poses of bodies: any rotation, at pixels where targets differ from images without the bodies."""
+"""Starts of a search for unknown poses: bodies turned any way, where targets differ from images without them."""
 
 from collections.abc import Mapping
 
@@ -9,7 +9,7 @@ from warpshadow.inverse.free import Pose
 from warpshadow.inverse.free.base import Values
 from warpshadow.inverse.model import Model
 
-_PIXELS = 4  # whose mean ray passes through a body: single ones may be of its shadow, or at its edge
+_PIXELS = 4  # whose mean ray a body is on: single ones may be of its shadow, or at its edge
 _DEPTH_SPREAD = 0.15  # standard deviation of the logarithm of a body's distance from the eye
 
 
@@ -23,7 +23,7 @@ def candidates_anywhere(model: Model, values: Mapping[str, Values], count: int, 
     Args:
         model: Of small images.
         values: Free parameters by name, at the start.
-        count: Number of draws.
+        count: How many.
         seed: Of the random draws.
     """
     poses = model.problem.free_of(Pose)

@@ -145,7 +145,7 @@ def pose_stages(problem: Problem) -> tuple[Stage, ...]:
 
 
 def unknown_pose_stages(problem: Problem) -> tuple[Stage, ...]:
-    """Find the pose of a body in view, otherwise unknown.
+    """Find an unknown pose of a body in view.
 
     A rotation drawn at random is within 45° of the right one, from where a descent leads there, in 2.5% of the draws.
     So 96 poses, or 24 of bodies that turn about one axis, go six steps in small images with soft shadows; the best 16

@@ -63,11 +63,11 @@ class Verdict:
 
     @property
     def unexplained(self) -> dict[str, float]:
-        """Shares that targets show of bodies, by name, where they are too small."""
-        return {name: shown_share for name, shown_share in self.shown.items() if shown_share < MIN_EXPLAINED_SHARE}
+        """Shares of bodies that are too small, by name."""
+        return {name: shown for name, shown in self.shown.items() if shown < MIN_EXPLAINED_SHARE}
 
     def __str__(self) -> str:
-        parts = ", ".join(f"{shown_share:.0%} of {name!r}" for name, shown_share in self.unexplained.items())
+        parts = ", ".join(f"{shown:.0%} of {name!r}" for name, shown in self.unexplained.items())
         error = self.image_error
         texts = [
             "" if error is None else f"images are off by {error:.0%} of their root mean square",
@@ -85,7 +85,7 @@ def verdict(problem: Problem, context: FitContext, values: Mapping[str, Values],
     compares, is_exposure_known = last.compares == "all", problem.light is None and not problem.free_of(Exposure)
     return Verdict(
         image_error(model, images) if compares else None,
-        {names[number]: shown_share for number, shown_share in explained_shares(model, values, images).items()},
+        {names[number]: shown for number, shown in explained_shares(model, values, images).items()},
         0.0 if problem.targets[0].image.shape[2] == 4 else unseen_share(model, images),
         exposure_gaps(model, images) if is_exposure_known else {},
     )
