@@ -133,8 +133,8 @@ def trace_hits(
     Differentiable: no.
     """
     shape, device = directions.shape, points.device
-    shapes = hit_shapes(reflections, *shape)
-    hits = LobeHits(*(empty(*each, device=device) for each in zip(shapes, HIT_TYPES, strict=True)))
+    kinds = zip(hit_shapes(reflections, *shape), HIT_TYPES, strict=True)
+    hits = LobeHits(*(empty(hit_shape, dtype=dtype, device=device) for hit_shape, dtype in kinds))
     inputs = [mesh.id, light_of_face, faces, vertex_normals, points, normals, directions, transmittance]
     launch(_trace_hits, shape, inputs=inputs, outputs=[*hits], cost=2 * RAY_COST * shape[1])
     return hits
