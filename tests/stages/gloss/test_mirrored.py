@@ -162,7 +162,7 @@ def test_a_metal_shows_the_body_that_it_mirrors(wall, device):
     assert np.isin(numbers[0], (0, 1)).all() and (np.isin(numbers[1], (2, 3)) == (wall != 0)).all()
     values = (roughness, albedo, metallic)
     barycentrics = np.where(numbers[..., None] >= 0, hits.barycentrics.numpy(), 0)
-    rough, color, share = (np.einsum("krsc,krsc...->krs...", barycentrics, each[corners]) for each in values)
+    rough, color, share = (np.einsum("krsc,krsc...->krs...", barycentrics, array[corners]) for array in values)
     ray, fresnel = directions, []
     for normals, is_met in zip(hits.normals.numpy(), numbers >= 0, strict=True):
         cosines = np.where(is_met, (ray * normals).sum(axis=-1), 0)[..., None]

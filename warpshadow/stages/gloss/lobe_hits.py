@@ -128,13 +128,13 @@ def trace_hits(
         points, normals: Of the receivers, vec3 of shape [receiver].
         directions: Of the samples, vec3 of shape [receiver, sample].
         transmittance: Of the samples, float32 of shape [receiver, sample]; where it is 1 nothing is traced.
-        reflections: Maximum number of bodies that a ray meets one after another.
+        reflections: Most bodies that a ray meets one after another.
 
     Differentiable: no.
     """
     shape, device = directions.shape, points.device
-    shapes = hit_shapes(reflections, *shape)
-    hits = LobeHits(*(empty(*shape_and_type, device=device) for shape_and_type in zip(shapes, HIT_TYPES, strict=True)))
+    kinds = zip(hit_shapes(reflections, *shape), HIT_TYPES, strict=True)
+    hits = LobeHits(*(empty(hit_shape, dtype=dtype, device=device) for hit_shape, dtype in kinds))
     inputs = [mesh.id, light_of_face, faces, vertex_normals, points, normals, directions, transmittance]
     launch(_trace_hits, shape, inputs=inputs, outputs=[*hits], cost=2 * RAY_COST * shape[1])
     return hits
