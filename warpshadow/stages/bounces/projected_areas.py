@@ -243,4 +243,5 @@ def find_projected_areas(
         variables=variables,
         shared=shared,
         cost=_CELL_COST * length,
+        adj_cost=_CELL_COST * length,
     )

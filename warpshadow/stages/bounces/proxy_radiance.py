@@ -191,4 +191,5 @@ def find_proxy_radiance(
         variables=[],
         shared=list(arrays.values()),
         cost=_CELL_COST * length,
+        adj_cost=_CELL_COST * length,
     )

@@ -328,6 +328,7 @@ def shade_cells(
     check.shape("light", light.shape, ("batch", len(directions)))
     finite_arrays({"light": light}, maximum=maximum)
     use_vector_registers(__name__, device)
+    cost = _RECEIVER_COST + _COEFFICIENT_COST * len(directions)
     return launch_with_adjoint(
         _shade_cells,
         _shade_cells_adjoint,
@@ -335,5 +336,6 @@ def shade_cells(
         inputs=[*cells, as_chunks(_channels(light))],
         result=empty(normals.shape, dtype=wp.vec3, device=device),
         variables=cells[:2],
-        cost=_RECEIVER_COST + _COEFFICIENT_COST * len(directions),
+        cost=cost,
+        adj_cost=cost,
     )

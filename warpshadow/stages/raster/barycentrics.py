@@ -160,5 +160,6 @@ def find_barycentrics(face_ids: wp.array, faces: wp.array, clip_positions: wp.ar
         variables=[],
         shared=[clip_positions],
         cost=_COST * run,
+        adj_cost=_COST * run,  # most samples have no gradient
     )
     return reshaped(barycentrics, face_ids.shape)
