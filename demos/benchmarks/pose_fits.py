@@ -1,10 +1,11 @@
 """How long a pose fit takes, beside a plain loop of Adam.
 
-    python demos/benchmarks/pose_fits.py [--count 10] [--size 128] [--ways stages]
+    python demos/benchmarks/pose_fits.py [--count 10] [--first 0] [--size 128] [--ways stages]
 
 The bunny on a ground, turned by 40°, its target rendered; and random poses, 10° to 40° and 5% to 25% of the diagonal
 off, their targets ray traced. ``pose_stages`` and ``inverse.fit`` beside what one writes first: Adam on a turn and a
-shift, 150 steps at a rate of 0.03, squares of differences at the target's size.
+shift, 150 steps at a rate of 0.03, squares of differences at the target's size. The way "search" is
+``unknown_pose_stages``.
 
 Printed are iterations, times, and how far vertices are off in the end (MDE, in percent of the diagonal). Times are
 from the call to the first iterate that is at most 0.5% off, to the one from which on all are, and to the end. They
@@ -13,6 +14,7 @@ include making renderers; kernels and spheres are best made before, by a run wit
 
 import argparse
 import dataclasses
+import functools
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -119,7 +121,11 @@ def moved(body: ws.Body, rotation: np.ndarray, translation: np.ndarray) -> ws.Bo
     return dataclasses.replace(body, rotation=vector, translation=translation)
 
 
-def staged(scene: ws.Scene, target: np.ndarray) -> list[Moment]:
+def staged(
+    scene: ws.Scene,
+    target: np.ndarray,
+    stages: Callable[[inverse.Problem], Sequence[inverse.Stage]] = inverse.pose_stages,
+) -> list[Moment]:
     """The ready-made stages."""
     watch = Stopwatch()
     problem = inverse.Problem(scene, inverse.Target(target), inverse.Pose(0))
@@ -139,7 +145,7 @@ def staged(scene: ws.Scene, target: np.ndarray) -> list[Moment]:
         optimizer.step = watched
         return optimizer
 
-    result = inverse.fit(problem, inverse.pose_stages(problem), optimizer=make, progress=False)
+    result = inverse.fit(problem, stages(problem), optimizer=make, progress=False)
     watch.note(lambda: result.scene.bodies[0])
     return watch.moments
 
@@ -162,7 +168,7 @@ def row(name: str, way: str, outcome: Outcome) -> str:
     return f"{name:10} {way:6} {outcome.iterations:4.0f}   {first}   {last}   {whole}   {outcome.error:8.4f}"
 
 
-def main(count: int, size: int, ways: list[str]) -> None:
+def main(count: int, first: int, size: int, ways: list[str]) -> None:
     ws.quiet()
     torch.set_num_threads(1)
     print(f"{cpu_text().splitlines()[0]}; seconds by the clock and by the processor")
@@ -171,7 +177,7 @@ def main(count: int, size: int, ways: list[str]) -> None:
     cases = {"bunny 40°": (changed(truth, 0, **placement(turned(truth.bodies[0], TURN))), ws.Renderer(truth).render())}
     truth = bunny_on_ground(size)
     wanted = ray_traced(truth)
-    for seed in range(count):
+    for seed in range(first, count):
         body = displaced(truth.bodies[0], np.random.default_rng(seed))
         cases[f"random {seed}"] = (changed(truth, 0, **placement(body)), wanted)
     outcomes: dict[str, list[Outcome]] = {way: [] for way in ways}
@@ -186,14 +192,17 @@ def main(count: int, size: int, ways: list[str]) -> None:
             print(row("median", way, median(each)))
 
 
-WAYS = {"plain": plain, "stages": staged}
+WAYS = {"plain": plain, "stages": staged, "search": functools.partial(staged, stages=inverse.unknown_pose_stages)}
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=10, help="random poses")
+    parser.add_argument("--first", type=int, default=0, help="number of the first of them")
     parser.add_argument(
         "--size", type=int, default=128, help="pixels of random poses' images; that of 40° has twice it"
     )
-    parser.add_argument("--ways", nargs="*", choices=[*WAYS], default=[*WAYS], help="both by default")
+    parser.add_argument(
+        "--ways", nargs="*", choices=[*WAYS], default=["plain", "stages"], help="plain and stages by default"
+    )
     arguments = parser.parse_args()
-    main(arguments.count, arguments.size, arguments.ways)
+    main(arguments.count, arguments.first, arguments.size, arguments.ways)

@@ -79,6 +79,7 @@ def test_realsense_intrinsics_show_points_where_its_library_does():
         ("tvec: got", {"tvec": np.zeros((3, 3))}),
         ("tvec: got 1 NaN", {"tvec": [0, np.nan, 1]}),
         ("K: got", {"K": np.zeros((3, 4))}),
+        ("K: got .*; the order is rvec, tvec, K", {"rvec": K, "tvec": RVEC, "K": TVEC}),
         ("size: missing", {"size": None}),
         ("distortion: got", {"distortion": [0, 0, 1e-3, 0]}),
         ("rotation: got", {"rvec": 2 * np.eye(3)}),

@@ -141,6 +141,7 @@ def _checked_numbers(name: str, given_numbers: object, *shapes: tuple[int, ...])
     expected = "an array of shape " + " or ".join(map(str, shapes))
     values = check.numbers(name, given_numbers, expected=expected, dtype=np.float64)
     if values.shape not in shapes:
-        raise ValueError(f"{name}: got {check.described(values)}, expected {expected}")
+        order = "; the order is rvec, tvec, K, as of cv2.projectPoints" if name == "K" else ""
+        raise ValueError(f"{name}: got {check.described(values)}, expected {expected}{order}")
     check.finite(name, values)
     return values
