@@ -14,6 +14,7 @@ from warpshadow.pipeline.receivers import groups
 from warpshadow.pipeline.renderer import SceneRenderer
 from warpshadow.stages.planes.fronts import NearestBlockers
 from warpshadow.stages.receivers.body_spans import Span
+from warpshadow.torch import TorchRenderer
 
 CAMERA = ws.Camera.look_at((2.0, 2.6, 4.6), (0, 0.5, 0), fov_y=40, size=(24, 24))
 VISIBILITY = ws.Visibility(directions=32)
@@ -59,6 +60,17 @@ def test_the_order_of_bodies_does_not_change_an_image(kinds, bounces):
     first = images.pop(kinds)
     for order, image in images.items():
         np.testing.assert_allclose(image, first, atol=2e-2 if bounces else 5e-4, err_msg=str(order))  # patches differ
+
+
+def test_the_order_of_bodies_does_not_change_light_that_is_cached_for_static_ones():
+    """Rays towards light are drawn for each vertex of a body, whatever number it has in the scene."""
+    images = []
+    for order in (("ball", "box", "ground"), ("ground", "ball", "box")):
+        scene = ws.Scene(tuple(bodies_of(order)), ws.synthetic_sky(), CAMERA, visibility=VISIBILITY)
+        renderer = TorchRenderer(scene, progress=False)
+        geometry = renderer.placed(*renderer.scene_poses(), moving=["ball"])
+        images.append(renderer(geometry=geometry).numpy())
+    np.testing.assert_allclose(*images, atol=1e-6)
 
 
 def test_points_of_no_body_get_light_from_flat_bodies():

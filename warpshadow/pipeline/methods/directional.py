@@ -272,9 +272,11 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         points, normals = static_bodies.gathered(vertices, normals)
         numbers = split_sides(vertices, len(static_bodies.has_vertex))[0]
         arrays = from_numpy(static_bodies.ray_origins[numbers], dtype=wp.vec3, device=points.device), normals[0]
-        vertex_numbers = wp.array(numbers, dtype=wp.int32, device=points.device)
+        merged_scene = self.merged_scene
+        of_bodies = numbers - merged_scene.first_vertex[merged_scene.body_of_vertex[numbers]]  # whatever their order
+        ids = wp.array(of_bodies, dtype=wp.int32, device=points.device)
         samples = self._lit_samples if is_scene_light else self._even_samples
-        return trace_cells(static_bodies.mesh, *arrays, vertex_numbers, samples, progress=self.progress)
+        return trace_cells(static_bodies.mesh, *arrays, ids, samples, progress=self.progress)
 
     @functools.cached_property
     def _lit_samples(self) -> CellSamples:
