@@ -100,3 +100,33 @@ def surface(body: ws.Body, kind: str = "gltf") -> dict[str, Any]:
         raise ValueError("Mitsuba: got specular values of a body, expected one, which is all that principled takes")
     textures["specular"] = 0.5 * float(values["specular"][0])  # 4% straight on
     return {"type": "principled", "base_color": color_of(body), **textures}
+
+
+def alike(body: ws.Body) -> dict[str, dict[str, Any]]:
+    """Mitsuba's own surfaces for a body of one metal or one plastic, by their names."""
+    color = {"type": "rgb", "value": [*map(float, body.albedo)]}
+    microfacets = {"distribution": "ggx", "alpha": float(body.roughness[0]) ** 2}
+    if body.metallic is not None and body.metallic[0] == 1:
+        other = {"type": "roughconductor", "material": "none", "specular_reflectance": color, **microfacets}
+    else:
+        other = {"type": "roughplastic", "int_ior": 1.5, "diffuse_reflectance": color, **microfacets}
+    return {"principled": surface(body, "principled"), other["type"]: other}
+
+
+def reflected_light(of_surface: dict[str, Any], degrees: float, rows: int = 64) -> np.ndarray:
+    """The BRDF of a surface times the cosine, over directions of the hemisphere of equal solid angles, [3, direction].
+
+    Args:
+        of_surface: As of :func:`surface`, or one of Mitsuba's own.
+        degrees: Angle of the viewer from the normal.
+        rows: Of directions, of which each has twice as many.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    height, azimuth = ((np.mgrid[:rows, : 2 * rows] + 0.5) / np.array([rows, 2 * rows])[:, None, None]).reshape(2, -1)
+    azimuth, slant, viewer = 2 * np.pi * azimuth, np.sqrt(1 - height**2), np.radians(degrees)
+    directions = mi.Vector3f(slant * np.cos(azimuth), slant * np.sin(azimuth), height)
+    point = dr.zeros(mi.SurfaceInteraction3f, len(height))
+    point.wi = mi.Vector3f(float(np.sin(viewer)), 0.0, float(np.cos(viewer)))
+    return np.array(mi.load_dict(of_surface).eval(mi.BSDFContext(), point, directions, mi.Bool(True)))

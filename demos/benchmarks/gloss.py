@@ -3,6 +3,8 @@
     python demos/benchmarks/gloss.py [--data FOLDER] [--size 96] [--bounces 0|1|…] [--picture gloss.png]
     python demos/benchmarks/gloss.py --textured [--surface gltf|principled] [--data FOLDER] [--bounces 0|1|…]
     python demos/benchmarks/gloss.py --loops [--data FOLDER] [--size 96] [--bounces 0|1|…]
+    python demos/benchmarks/gloss.py --brdfs
+    python demos/benchmarks/gloss.py --fits [--data FOLDER] [--size 96] [--bounces 0|1|…]
 
 FOLDER has meshes/ and envmaps/, as for demos/benchmarks/accuracy.py. Mitsuba renders the same surface
 (demos/mitsuba_gloss.py), so that nothing is due to another one. Errors are of the whole image, and of the body that
@@ -10,6 +12,9 @@ shines alone, relative L2, noise of the reference taken off. With --textured bod
 metallic; a second line has the means of these in the library's images, and --surface principled Mitsuba's own surface,
 which differs a little. With --loops it prints the CPU time of an iteration of
 a torch loop in which the body moves, image and gradient, of the diffuse body and of those that shine, without Mitsuba.
+With --brdfs it prints how far Mitsuba's own surfaces are from this one, by the angle of the viewer, relative L2 over
+the hemisphere; with --fits the roughness and the metallic that a fit finds from Mitsuba's image, where all else is
+known.
 """
 
 import argparse
@@ -24,14 +29,18 @@ import torch
 
 sys.path.append(str(Path(__file__).parents[2]))  # the folder of demos
 import warpshadow as ws
+from demos import mitsuba_gloss
 from demos.references import Reference, Request
 from demos.scenes import shipped_mesh
 from demos.shapes import bottle, knot
+from warpshadow import inverse
 from warpshadow.torch import TorchRenderer
 
 ROUGHNESS = (0.2, 0.35, 0.6)
 KINDS = {"metal": {"albedo": (0.9, 0.65, 0.35), "metallic": 1.0}, "plastic": {"albedo": (0.15, 0.35, 0.6)}}
 METHODS = ("still", "renderer")
+VIEWERS = (0, 30, 60, 75)  # from the normal [degrees]
+START = {"roughness": 0.5, "metallic": 0.5}  # of fits
 
 
 def scenes(data: Path | None, size: int, count: int) -> dict[str, ws.Scene]:
@@ -146,6 +155,42 @@ def print_loops(of_bodies: dict[str, ws.Scene], bounces: int) -> None:
         print(line, flush=True)
 
 
+def print_brdfs() -> None:
+    """Print how far surfaces of Mitsuba are from glTF's, the same but for their formulas."""
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    print(f"{'kind':9}{'roughness':11}{'surface':15}" + "".join(f"{degrees:6}°" for degrees in VIEWERS))
+    for kind, roughness in itertools.product(KINDS, ROUGHNESS):
+        body = ws.Body(ws.icosphere(1.0, 1), roughness=roughness, **KINDS[kind])
+        for name, other in mitsuba_gloss.alike(body).items():
+            line = f"{kind:9}{roughness:<11}{name:15}"
+            for degrees in VIEWERS:
+                ours, theirs = (
+                    mitsuba_gloss.reflected_light(each, degrees) for each in (mitsuba_gloss.surface(body), other)
+                )
+                line += f"{np.linalg.norm(theirs - ours) / np.linalg.norm(ours):7.1%}"
+            print(line, flush=True)
+
+
+def find_gloss(scene: ws.Scene, image: np.ndarray) -> tuple[float, float]:
+    """Roughness and metallic of the first body, from an image of it whose other values the scene has."""
+    start = dataclasses.replace(scene, bodies=(dataclasses.replace(scene.bodies[0], **START), *scene.bodies[1:]))
+    problem = inverse.Problem(start, inverse.Target(image), [inverse.Roughness(0), inverse.Metallic(0)])
+    found = inverse.fit(problem, inverse.Stage(40), progress=False).scene.bodies[0]
+    return float(found.roughness[0]), float(found.metallic[0])
+
+
+def print_fits(of_bodies: dict[str, ws.Scene], bounces: int, samples: int, references: Path) -> None:
+    """Print the gloss that fits find from Mitsuba's images."""
+    print(f"{'body':16}{'roughness':10}{'kind':9}{'found':>8}{'metallic':>10}")
+    for name, plain in of_bodies.items():
+        for label, truth, _ in cases(dataclasses.replace(plain, bounces=bounces), has_textures=False):
+            reference = Request(truth, "mitsuba", bounces, samples, references).reference()
+            roughness, metallic = find_gloss(truth, reference.mean.astype(np.float32))
+            print(f"{name:16}{label}{roughness:8.3f}{metallic:10.2f}", flush=True)
+
+
 def main() -> None:
     """Print the tables, and write a contact sheet."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -160,10 +205,19 @@ def main() -> None:
     parser.add_argument("--textured", action="store_true", help="bodies with textures of roughness and metallic")
     parser.add_argument("--surface", choices=("gltf", "principled"), default="gltf", help="of Mitsuba")
     parser.add_argument("--loops", action="store_true", help="times of iterations of a torch loop, and no images")
+    parser.add_argument("--brdfs", action="store_true", help="differences of surfaces, and no images")
+    parser.add_argument("--fits", action="store_true", help="gloss that fits find, and no images")
     arguments = parser.parse_args()
     ws.quiet()
     if arguments.loops:
         print_loops(scenes(arguments.data, arguments.size, arguments.bodies), arguments.bounces)
+        return
+    if arguments.brdfs:
+        print_brdfs()
+        return
+    if arguments.fits:
+        of_bodies = scenes(arguments.data, arguments.size, arguments.bodies)
+        print_fits(of_bodies, arguments.bounces, arguments.samples, arguments.references)
         return
     errors: dict[str, list[float]] = {method: [] for method in arguments.methods}
     sheet, by = [], "mitsuba" if arguments.surface == "gltf" else arguments.surface

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 import warpshadow as ws
-from demos.benchmarks import gradients
+from demos.benchmarks import gloss, gradients
 from demos.benchmarks.benchmark import bunny_scene
 from demos.examples import shadow_gradient, warp_loop
 from demos.scenes import on_ground
@@ -62,6 +62,14 @@ def test_a_small_image_has_the_gradient_of_its_differences():
     renderer = gradients.renderer_of(scene, 64, 2)
     got, expected = (of(renderer, gradients.pose_image, 5) for of in (gradients.gradients, gradients.differences))
     assert gradients.relative_error(got, expected) < 0.08
+
+
+@pytest.mark.slow
+def test_the_gloss_of_an_image_is_found():
+    ball = ws.Body(ws.icosphere(1.0, 3), albedo=(0.9, 0.65, 0.35), roughness=0.3, metallic=1.0).on_ground(size=2)
+    camera = ws.Camera.framing(ball, direction=(-0.4, 0.5, 1), size=24)
+    scene = ws.Scene([ball, ws.Body(ws.plane(8.0, 8))], ws.synthetic_sky(sun_radius=8, height=32), camera)
+    assert gloss.find_gloss(scene, ws.render(scene)) == pytest.approx((0.3, 1.0), abs=0.03)
 
 
 def test_the_pictures_of_the_demos_are_drawn(tmp_path):
