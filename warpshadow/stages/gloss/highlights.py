@@ -1,7 +1,7 @@
 """Highlights: the light of emitters in the lobes of receivers, a sum over their samples.
 
 A sample k of an emitter (:mod:`.emitters.samples`) fills a solid angle Ω_k around ω_k, with the radiance L_k and the
-transmittance T_k on the way. With c_k = n·ω_k and the reflection f of :mod:`.lobes` it adds to a lobe's light G and G'
+transmittance T_k on the way. With c_k = n·ω_k and the reflection f of :mod:`.ggx` it adds to a lobe's light G and G'
 
     f c_k Ω_k T_k L_k,   f c_k Ω_k T_k L_k (1 − v·h)⁵,   α_k² = α² + Ω_k / (4π)
 
@@ -18,6 +18,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, facing_area, may_light, sample_transmittance
+from warpshadow.stages.gloss.ggx import fresnel_weight, reflect
 from warpshadow.stages.gloss.lobes import MAX_COSINE, MIN_COSINE, MIN_ROUGHNESS
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.raster.project import eye_position
@@ -25,16 +26,6 @@ from warpshadow.stages.raster.project import eye_position
 _COST = 20.0  # nanoseconds that a sample takes
 
 wp.set_module_options({"max_unroll": 1})
-
-
-@wp.func
-def _reflect(normal_cosine: float, cosine: float, view_cosine: float, square: float):
-    """D V of mirrors of the width √square, given n·h, n·l and n·v."""
-    ellipsoid = normal_cosine * normal_cosine * (square - 1.0) + 1.0
-    slant = wp.sqrt(cosine * cosine * (1.0 - square) + square)
-    view_slant = wp.sqrt(view_cosine * view_cosine * (1.0 - square) + square)
-    density = square / (wp.pi * ellipsoid * ellipsoid)
-    return 0.5 * density / (cosine * view_slant + view_cosine * slant)
 
 
 @wp.kernel
@@ -83,11 +74,10 @@ def _sum_highlights(
             mirror = wp.normalize(view + beam / distance)
             square = wp.min(rough * rough * rough * rough + solid_angle / (4.0 * wp.pi), 1.0)
             weight = cosine * solid_angle * sample_transmittance(transmittance, batch, receiver, i)
-            weight = weight * _reflect(wp.dot(normal, mirror), cosine, view_cosine, square)
-            base = wp.max(1.0 - wp.dot(view, mirror), 0.0)
+            weight = weight * reflect(wp.dot(normal, mirror), cosine, view_cosine, square)
             light = weight * radiance[radiance_batch, first_sample + i]
             sum_f0 += light
-            sum_f90 += base * base * base * base * base * light
+            sum_f90 += fresnel_weight(wp.dot(view, mirror)) * light
     light_f0[batch, receiver] = sum_f0
     light_f90[batch, receiver] = sum_f90
 

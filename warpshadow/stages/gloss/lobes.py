@@ -1,18 +1,15 @@
 """Lobes: the directions from which a glossy receiver takes its light, and how much of it.
 
-The surface is made of mirrors with normals h of the GGX distribution of width α = roughness², which hide each other as
-Smith says, correlated by height [glTF 2.0, appendix B]. With n·v = μ and n·l = c it reflects, but for Fresnel's factor,
-
-    f = D V,  D = α² / (π ((n·h)² (α² − 1) + 1)²),  V = ½ / (c Λ(μ) + μ Λ(c)),  Λ(x) = √(x² (1 − α²) + α²).
-
-Where normals vary over a receiver by a and b (:mod:`.normal_spread`), its mirrors are as wide as those of its surface
-and of its normals together [Kaplanyan et al. 2016, Filtering Distributions of Normals for Shading Antialiasing]: with
-a, b and h_t across the normal, and half the variance of a Gaussian, since the tails of GGX are long,
+With a normal n, a viewer v, light from l, n·v = μ and n·l = c the surface reflects f = D V, whose mirrors have normals
+h and the width α = roughness² (:mod:`.ggx`). Where normals vary over a receiver by a and b (:mod:`.normal_spread`), its
+mirrors are as wide as those of its surface and of its normals together [Kaplanyan et al. 2016, Filtering Distributions
+of Normals for Shading Antialiasing]: with a, b and h_t across the normal, and half the variance of a Gaussian, since
+the tails of GGX are long,
 
     W² = α² + (a aᵀ + b bᵀ) / 12,  D = 1 / (π |W| (|W⁻¹h_t|² + (n·h)²)²),  Λ(v) = √((n·v)² + |W v_t|²),
 
-which is the above for a = b = 0. Samples are mirrors that the viewer sees, spread evenly over them [Dupuy and Benyoub
-2023, Sampling Visible GGX Normals with Spherical Caps]: sample i of N has the weight
+which is that of :mod:`.ggx` for a = b = 0. Samples are mirrors that the viewer sees, spread evenly over them [Dupuy
+and Benyoub 2023, Sampling Visible GGX Normals with Spherical Caps]: sample i of N has the weight
 
     w = G₂ / G₁ / N = c (μ + Λ(μ)) / (c Λ(μ) + μ Λ(c)) / N,   w' = w (1 − v·h)⁵,
 
@@ -39,6 +36,7 @@ from warpshadow.device.launch import launch, varies
 from warpshadow.device.memory import empty, in_huge_pages, require_gradient
 from warpshadow.device.parallel import split_row
 from warpshadow.device.tape import record_adjoint
+from warpshadow.stages.gloss.ggx import make_ggx
 from warpshadow.stages.gloss.normal_spread import NormalSpread
 from warpshadow.stages.raster.project import eye_position
 
@@ -130,11 +128,11 @@ def _shape_lobes(
     trace = wp.sqrt(square_xx + square_yy + 2.0 * determinant)  # of W
     width = wp.vec3(square_xx + determinant, square_xy, square_yy + determinant) / trace
     stretched_view = wp.vec3(width[0] * sine, width[1] * sine, cosine)
-    smith_lambda = wp.length(stretched_view)
+    lambda_of_view = wp.length(stretched_view)
     lobe_normals[batch, receiver] = normal
     tangents[batch, receiver] = tangent
-    view_terms[batch, receiver] = wp.vec3(sine, cosine, smith_lambda)
-    cap_axes[batch, receiver] = stretched_view / smith_lambda
+    view_terms[batch, receiver] = wp.vec3(sine, cosine, lambda_of_view)
+    cap_axes[batch, receiver] = stretched_view / lambda_of_view
     widths[batch, receiver] = width
     cosines[batch, receiver] = cosine
 
@@ -154,6 +152,7 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
     """Make the kernel and its adjoint, which take as many samples of a lobe at once as there are lanes."""
     Lane, Vectors, fn = lane_type(lanes), vectors_type(lanes), make_lane_functions(lanes)
     sqrt, is_positive, dot, dot_direction, total = fn.sqrt, fn.is_positive, fn.dot, fn.dot_direction, fn.total
+    stretch, smith_lambda, fresnel_weight, fresnel_rate = make_ggx(lanes)
 
     @wp.func
     def load_or_zero(vectors: wp.array(dtype=wp.vec3), first: int):
@@ -182,11 +181,6 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         y = wp.cw_mul(radius, sine) + Lane(cap[1])
         return Vectors(x, y, z), radius
 
-    @wp.func
-    def stretch(width: wp.vec3, x: Lane, y: Lane):
-        """W (x, y)."""
-        return width[0] * x + width[1] * y, width[1] * x + width[2] * y
-
     @wp.kernel(module="unique", module_options=module_options(lanes), enable_backward=False)
     def sample_lobes(
         first_row: int,
@@ -211,9 +205,9 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         tangent = tangents[batch, receiver]
         bitangent = wp.cross(normal, tangent)
         view = view_terms[batch, receiver]
-        sine, cosine, smith_lambda = view[0], view[1], view[2]
+        sine, cosine, lambda_of_view = view[0], view[1], view[2]
         width = widths[batch, receiver]
-        weight_scale = (cosine + smith_lambda) / float(directions.shape[2])
+        weight_scale = (cosine + lambda_of_view) / float(directions.shape[2])
         blur_scale = blur_share * wp.sqrt(weight_scale * (width[0] * width[2] - width[1] * width[1]))
         place = int(0)
         if places:
@@ -240,11 +234,9 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             direction_z = tangent[2] * x + bitangent[2] * y + normal[2] * z
             up = wp.max(z, Lane(0.0))
             spread_x, spread_y = stretch(width, x, y)
-            reflected_lambda = sqrt(wp.cw_mul(spread_x, spread_x) + wp.cw_mul(spread_y, spread_y) + wp.cw_mul(up, up))
-            weight = wp.cw_div(weight_scale * up, smith_lambda * up + cosine * reflected_lambda)
-            fresnel_base = wp.max(Lane(1.0) - view_cosine, Lane(0.0))
-            fresnel_square = wp.cw_mul(fresnel_base, fresnel_base)
-            weight_f90 = wp.cw_mul(weight, wp.cw_mul(wp.cw_mul(fresnel_square, fresnel_square), fresnel_base))
+            lambda_of_light = smith_lambda(spread_x, spread_y, up)
+            weight = wp.cw_div(weight_scale * up, lambda_of_view * up + cosine * lambda_of_light)
+            weight_f90 = wp.cw_mul(weight, fresnel_weight(view_cosine))
             first = block * lanes
             for lane in range(wp.min(lanes, directions.shape[2] - first)):
                 directions[batch, receiver, first + lane] = wp.vec3(
@@ -282,14 +274,14 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         tangent = tangents[batch, receiver]
         bitangent = wp.cross(normal, tangent)
         view = view_terms[batch, receiver]
-        sine, cosine, smith_lambda = view[0], view[1], view[2]
+        sine, cosine, lambda_of_view = view[0], view[1], view[2]
         width = widths[batch, receiver]
-        weight_scale = (cosine + smith_lambda) / float(adj_directions.shape[2])
+        weight_scale = (cosine + lambda_of_view) / float(adj_directions.shape[2])
         determinant = width[0] * width[2] - width[1] * width[1]
         blur_scale = blur_share * wp.sqrt(weight_scale * determinant)
         adj_sine = Lane(0.0)
         adj_cosine = Lane(0.0)
-        adj_smith_lambda = Lane(0.0)
+        adj_lambda_of_view = Lane(0.0)
         adj_weight_scale = Lane(0.0)
         adj_blur_scale = Lane(0.0)
         adj_width_xx = Lane(0.0)
@@ -321,12 +313,9 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             z = 2.0 * wp.cw_mul(view_cosine, mirror.z) - Lane(cosine)
             up = wp.max(z, Lane(0.0))
             spread_x, spread_y = stretch(width, x, y)
-            reflected_lambda = sqrt(wp.cw_mul(spread_x, spread_x) + wp.cw_mul(spread_y, spread_y) + wp.cw_mul(up, up))
-            denominator = smith_lambda * up + cosine * reflected_lambda
+            lambda_of_light = smith_lambda(spread_x, spread_y, up)
+            denominator = lambda_of_view * up + cosine * lambda_of_light
             weight = wp.cw_div(weight_scale * up, denominator)
-            fresnel_base = wp.max(Lane(1.0) - view_cosine, Lane(0.0))
-            fresnel_square = wp.cw_mul(fresnel_base, fresnel_base)
-            fresnel_fourth = wp.cw_mul(fresnel_square, fresnel_square)
 
             adj_direction = load_or_zero(adj_directions[batch, receiver], block * lanes)
             adj_weight = Lane()
@@ -338,17 +327,17 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
                 adj_weight[lane] = adj_pair[0]
                 adj_weight_f90[lane] = adj_pair[1]
                 adj_blur[lane] = adj_blurs[batch, receiver, first + lane]
-            adj_weight += wp.cw_mul(adj_weight_f90, wp.cw_mul(fresnel_fourth, fresnel_base))
-            adj_view_cosine = -5.0 * wp.cw_mul(wp.cw_mul(adj_weight_f90, weight), fresnel_fourth)
+            adj_weight += wp.cw_mul(adj_weight_f90, fresnel_weight(view_cosine))
+            adj_view_cosine = wp.cw_mul(wp.cw_mul(adj_weight_f90, weight), fresnel_rate(view_cosine))
             adj_ratio = wp.cw_div(adj_weight, denominator)
             adj_weight_scale += wp.cw_mul(adj_ratio, up)
             adj_denominator = -1.0 * wp.cw_mul(adj_ratio, weight)
-            adj_smith_lambda += wp.cw_mul(adj_denominator, up)
-            adj_cosine += wp.cw_mul(adj_denominator, reflected_lambda)
-            adj_square = wp.cw_div(cosine * adj_denominator, reflected_lambda)
+            adj_lambda_of_view += wp.cw_mul(adj_denominator, up)
+            adj_cosine += wp.cw_mul(adj_denominator, lambda_of_light)
+            adj_square = wp.cw_div(cosine * adj_denominator, lambda_of_light)
             adj_spread_x = wp.cw_mul(adj_square, spread_x)
             adj_spread_y = wp.cw_mul(adj_square, spread_y)
-            adj_up = weight_scale * adj_ratio + smith_lambda * adj_denominator + wp.cw_mul(adj_square, up)
+            adj_up = weight_scale * adj_ratio + lambda_of_view * adj_denominator + wp.cw_mul(adj_square, up)
             adj_x, adj_y = stretch(width, adj_spread_x, adj_spread_y)
             adj_x += dot_direction(tangent, adj_direction)
             adj_y += dot_direction(bitangent, adj_direction)
@@ -389,12 +378,12 @@ def _make_sample_lobes(lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
             adj_axis_z += wp.cw_mul(adj_cap_z, Lane(1.0) - height_share) - wp.cw_mul(adj_height, height_share)
         scale_rate = total(adj_weight_scale) / float(adj_directions.shape[2])
         blur_rate = 0.5 * blur_scale * total(adj_blur_scale)
-        scale_rate += blur_rate / (cosine + smith_lambda)
+        scale_rate += blur_rate / (cosine + lambda_of_view)
         blur_rate = blur_rate / determinant
         adj_normals[batch, receiver] = adj_normals[batch, receiver] + adj_normal + wp.cross(tangent, adj_bitangent)
         adj_tangents[batch, receiver] = adj_tangents[batch, receiver] + adj_tangent + wp.cross(adj_bitangent, normal)
         adj_views[batch, receiver] = adj_views[batch, receiver] + wp.vec3(
-            total(adj_sine), total(adj_cosine) + scale_rate, total(adj_smith_lambda) + scale_rate
+            total(adj_sine), total(adj_cosine) + scale_rate, total(adj_lambda_of_view) + scale_rate
         )
         adj_caps[batch, receiver] = adj_caps[batch, receiver] + total_vector(adj_axis_x, adj_axis_y, adj_axis_z)
         adj_widths[batch, receiver] = (

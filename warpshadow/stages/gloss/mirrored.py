@@ -20,6 +20,7 @@ import warp as wp
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.launch import launch
 from warpshadow.device.parallel import split_row
+from warpshadow.stages.gloss.ggx import fresnel_weight
 from warpshadow.stages.gloss.lobe_hits import LEAVES_BELOW, MEETS_SKY, LobeHits
 from warpshadow.stages.gloss.lobes import MIN_ROUGHNESS
 from warpshadow.stages.planes.face_texels import FaceTexels, no_face_texels, radiosity_at
@@ -41,16 +42,15 @@ def _reflect(
     roughness: wp.array(dtype=wp.float32),
 ):
     """Reflect a ray from a body: its direction, the square of its blur, and (1 − |n·l|)⁵. Without a face as it is."""
-    fresnel_weight = float(0.0)
+    weight_f90 = float(0.0)
     if face >= 0:
         width = wp.max(interpolate_at(roughness, faces[face], weights), MIN_ROUGHNESS)
         width = width * width
         square = square + 2.0 * width * width
         cosine = wp.dot(normal, direction)
-        fresnel_base = 1.0 - wp.min(wp.abs(cosine), 1.0)
-        fresnel_weight = fresnel_base * fresnel_base * fresnel_base * fresnel_base * fresnel_base
+        weight_f90 = fresnel_weight(wp.abs(cosine))
         direction = direction - 2.0 * cosine * normal
-    return direction, square, fresnel_weight
+    return direction, square, weight_f90
 
 
 @wp.kernel
@@ -76,7 +76,7 @@ def _mirror(
     hit_batch = instance_in(batch, face_ids.shape[0])
     of_vertices = roughness[instance_in(batch, roughness.shape[0])]
     blur = blurs[instance_in(batch, blurs.shape[0]), receiver, sample]
-    direction, square, fresnel_weight = _reflect(
+    direction, square, weight_f90 = _reflect(
         directions[instance_in(batch, directions.shape[0]), receiver, sample],
         blur * blur,
         face_ids[hit_batch, 0, receiver, sample],
@@ -85,10 +85,10 @@ def _mirror(
         faces,
         of_vertices,
     )
-    fresnel_weights[batch, 0, receiver, sample] = fresnel_weight
+    fresnel_weights[batch, 0, receiver, sample] = weight_f90
     last_direction, last_square = direction, square
     if face_ids.shape[1] > 1:
-        last_direction, last_square, last_fresnel_weight = _reflect(
+        last_direction, last_square, last_weight_f90 = _reflect(
             direction,
             square,
             face_ids[hit_batch, 1, receiver, sample],
@@ -97,7 +97,7 @@ def _mirror(
             faces,
             of_vertices,
         )
-        fresnel_weights[batch, 1, receiver, sample] = last_fresnel_weight
+        fresnel_weights[batch, 1, receiver, sample] = last_weight_f90
     mirrored[batch, receiver, sample] = last_direction
     mirrored_blurs[batch, receiver, sample] = wp.sqrt(last_square)
 
@@ -146,7 +146,7 @@ def _shine(
     diffuse: wp.vec3,
     face: int,
     weights: wp.vec3,
-    fresnel_weight: float,
+    weight_f90: float,
     faces: wp.array(dtype=wp.vec3i),
     albedo: wp.array(dtype=wp.vec3),
     metallic: wp.array(dtype=wp.float32),
@@ -159,7 +159,7 @@ def _shine(
     if face >= 0:
         color = interpolate_at(albedo, faces[face], weights)
         metal_share = interpolate_at(metallic, faces[face], weights)
-        fresnel = color + fresnel_weight * (wp.vec3(1.0) - color)
+        fresnel = color + weight_f90 * (wp.vec3(1.0) - color)
         if radiosity:
             diffuse = radiosity_at(radiosity[radiosity_batch], texels, faces, face, weights)
         result = metal_share * wp.cw_mul(fresnel, seen) + (1.0 - metal_share) * diffuse

@@ -26,6 +26,7 @@ from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import cell_radius
 from warpshadow.maths.suns import Suns
+from warpshadow.stages.gloss.ggx import fresnel_weight, masking, smith_lambda
 from warpshadow.stages.gloss.lobes import Lobes
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.gloss.transmittance import horizon_weight
@@ -112,12 +113,9 @@ def _reflect_disc(view: wp.vec3, width: wp.vec3, direction: wp.vec3, solid_angle
     disc = solid_angle / (4.0 * wp.pi * view_cosine * area * mirror[2] * mirror[2] * mirror[2])
     density = _disc_density(slope_x * slope_x + slope_y * slope_y, disc)
     density = density * 4.0 * view_cosine / (solid_angle * mirror[2])
-    spread_x = width[0] * direction[0] + width[1] * direction[1]
-    spread_y = width[1] * direction[0] + width[2] * direction[1]
-    smith_lambda = wp.sqrt(spread_x * spread_x + spread_y * spread_y + direction[2] * direction[2])
-    weight = 0.5 * density * direction[2] / (direction[2] * view[2] + view[1] * smith_lambda)
-    base = wp.max(1.0 - view_cosine, 0.0)
-    return wp.vec2(weight, weight * base * base * base * base * base)
+    lambda_of_light = smith_lambda(width, direction[0], direction[1], direction[2])
+    weight = density * direction[2] * masking(direction[2], lambda_of_light, view[1], view[2])
+    return wp.vec2(weight, weight * fresnel_weight(view_cosine))
 
 
 @wp.kernel
