@@ -1,12 +1,15 @@
 """Land and other height fields: which meshes are closed behind, and on which side."""
 
 import dataclasses
+import gc
+import weakref
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import warpshadow as ws
+from warpshadow.scene import height_fields
 from warpshadow.scene.blockers import SPHERES_BESIDE_PARTS, blocking_parts, fitted_counts, fitted_meshes
 
 CAMERA = ws.Camera.look_at((0, 2, 6), (0, 0.5, 0), size=(16, 16))
@@ -36,6 +39,16 @@ def ball(at=(0.3, 1.0, 0.2)) -> ws.Body:
 
 def fitted(body: ws.Body, *others: ws.Body) -> ws.Mesh:
     return fitted_meshes(ws.Scene([body, *others], ws.EnvironmentMap.constant(), CAMERA))[0][0]
+
+
+def test_solids_go_with_their_bodies_and_hold_no_others():
+    gc.collect()
+    count, other = len(height_fields._SOLIDS), ball()
+    assert fitted(ws.Body(land()), other) is not None
+    gone = weakref.ref(other)
+    del other
+    gc.collect()
+    assert len(height_fields._SOLIDS) == count and gone() is None
 
 
 def volume(mesh: ws.Mesh) -> float:

@@ -3,8 +3,8 @@
 Spheres in a sheet bulge out of both sides. Where nobody sees one side, they may lie behind it, as deep as they like.
 """
 
-import weakref
 from typing import NamedTuple
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 import warp as wp
@@ -46,8 +46,8 @@ class Land(NamedTuple):
     is_bowl: bool  # whether panels are better blockers: it is deep, and no body stands between it and its panels
 
 
-_SOLIDS: weakref.WeakKeyDictionary[Body, dict[tuple["weakref.ref[Body]", ...], Land | None]]
-_SOLIDS = weakref.WeakKeyDictionary()  # for as long as bodies live: a scene asks several times of each open one
+_SOLIDS: WeakKeyDictionary[Body, dict[tuple["ref[Body]", ...], Land | None]] = WeakKeyDictionary()
+"""Of bodies among others: a scene asks several times of each open one."""
 
 
 def solid_behind(body: Body, others: tuple[Body, ...]) -> Land | None:
@@ -60,7 +60,7 @@ def solid_behind(body: Body, others: tuple[Body, ...]) -> Land | None:
     """
     if body.mesh.surface.is_closed or body.mesh.is_flat:
         return None
-    known, key = _SOLIDS.setdefault(body, {}), tuple(map(weakref.ref, others))
+    known, key = _SOLIDS.setdefault(body, {}), tuple(map(ref, others))
     if key not in known:
         known[key] = _solid_behind(body, others)
     return known[key]

@@ -1,12 +1,14 @@
 """Cells that planes cover in part, by where their light is: against coverage of each direction alone, and rays."""
 
+import gc
+
 import numpy as np
 import pytest
 from plane_settings import DIRECTIONS, Setting
 
 import warpshadow as ws
 from warpshadow.maths.directions import cell_radius
-from warpshadow.pipeline.methods import directional
+from warpshadow.stages.planes import cells, partial_cells
 from warpshadow.stages.planes.coverage import plane_coverage
 from warpshadow.stages.planes.partial_cells import coverage_of_light
 
@@ -59,6 +61,16 @@ def test_directions_of_a_cell_are_eight(device):
         coverage_of_light(points, covered, frames, setting.planes, DIRECTIONS, samples_of_cells()[:, :3])
 
 
+def test_arrays_of_planes_go_with_them(device):
+    gc.collect()
+    count, planes = len(cells._ARRAYS), Setting(device).planes
+    assert cells.plane_arrays(planes, 0.1, None) is cells.plane_arrays(planes, 0.1, None)
+    assert len(cells._ARRAYS) == count + 1
+    del planes
+    gc.collect()
+    assert len(cells._ARRAYS) == count
+
+
 def behind_a_window(**visibility):
     """A wall whose light, of a bright sky above dark land, comes through a window in a wall without end."""
     land = np.full((32, 64, 3), 0.02)
@@ -80,7 +92,7 @@ def test_light_through_a_window_is_that_of_rays(monkeypatch):
     errors = []
     for sees_samples in (True, False):
         if not sees_samples:
-            monkeypatch.setattr(directional, "coverage_of_light", lambda points, covered, *_, **options: covered)
+            monkeypatch.setattr(partial_cells, "coverage_of_light", lambda points, covered, *_, **options: covered)
         found = ws.Renderer(behind_a_window()).render()[..., 0].mean(axis=1)
         errors.append(np.abs(found - truth).mean() / truth.mean())
     assert errors[0] < 0.095  # measured 0.080, and 0.154 by cells alone

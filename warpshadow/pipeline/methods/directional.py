@@ -115,12 +115,11 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
 
     def _coverages(self, kind: CoveringBlockers, group: Group, projected_light: ProjectedCells) -> CellCoverages:
         """Coverage of all cells and of sharp ones by blockers of a kind."""
-        coverage = kind.coverage(group, projected_light.blocking_directions, samples=projected_light.samples)
+        coverage = kind.coverage(group, projected_light.blocking_directions)
         sharp_cells = projected_light.sharp_cells_past_planes
         if sharp_cells is None:
             return CellCoverages(coverage)
-        radius = self._edge_radius(sharp_cells)
-        return CellCoverages(coverage, kind.coverage(group, sharp_cells.directions, radius=radius))
+        return CellCoverages(coverage, kind.coverage(group, sharp_cells.directions, self._edge_radius(sharp_cells)))
 
     def _past_coverages(
         self,
@@ -176,8 +175,12 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         self, group: Group, visibility: CellVisibility, projected_light: ProjectedCells
     ) -> CellVisibility:
         """Transmittance past the flat bodies around a group, too."""
-        assert group.blockers.planes is not None
-        covered = self._coverages(group.blockers.planes, group, projected_light)
+        planes, directions, samples = group.blockers.planes, visibility.directions, projected_light.samples
+        assert planes is not None
+        covered = self._coverages(planes, group, projected_light)
+        if samples is not None and planes.blockers.has_holes:
+            all_cells = planes.coverage_of_light(group, covered.all_cells, directions, samples)
+            covered = covered._replace(all_cells=all_cells)
         total = self._past_coverages(
             visibility.transmittance_self_and_spheres, covered, visibility.part_coverages, projected_light
         )

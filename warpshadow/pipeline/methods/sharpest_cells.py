@@ -76,7 +76,7 @@ def find_share_of_sharpest_light(
     if group.blockers.spheres is not None:
         options: dict[str, Any] = {"softness": softness, "merging": merging, "footprints": footprints}
         transmittance = group.blockers.spheres.transmittance(group, directions, **options)
-    coverages = [kind.coverage(group, directions, radius=edge_radius) for kind in group.blockers.covering]
+    coverages = [kind.coverage(group, directions, edge_radius) for kind in group.blockers.covering]
     if coverages:
         transmittance = transmittance_past(transmittance, *coverages)
     if transmittance is None:

@@ -70,9 +70,9 @@ def find_portions(
     if receivers.spans:
         groups = _groups_by_body(receivers, blockers, self_lookups or {}, nearest_blockers, by_body)
     else:
-        has_receivers = receivers.points.size > 0
-        all_blockers = blockers_around(blockers, group_spheres(blockers)) if has_receivers else GroupBlockers()
-        arrays = receivers.points, receivers.normals, all_blockers
+        has_any = bool(receivers.points.size)
+        group_blockers = blockers_around(blockers, group_spheres(blockers)) if has_any else GroupBlockers()
+        arrays = receivers.points, receivers.normals, group_blockers
         groups = iter([Group(*arrays, receivers.footprints, nearest_blockers=nearest_blockers)])
     for group in groups:
         yield from group.portions()
@@ -104,8 +104,8 @@ def _groups_by_body(
             return GroupKey(span.first < vertex_count, False, None, group_blockers)
         # where light bounces, these shadow themselves by their spheres (find_cell_transmittance)
         has_self_spheres = merged_scene.scene.bounces and lookup is None and body not in kinds.solids
-        self_blocker = group_blockers.self_blocker
-        is_of_one_body = self_blocker is not None and self_blocker.is_of_one_body
+        has_self_blocker = group_blockers.self_blocker is not None  # parts of one body without a lookup
+        is_of_one_body = has_self_blocker and (lookup is None or lookup.is_of_one_body)
         is_alone = by_body or merged_scene.is_flat[body] or has_self_spheres or is_of_one_body
         is_glossy = bool(merged_scene.is_glossy[body])
         return GroupKey(span.first < vertex_count, is_glossy, body if is_alone else None, group_blockers)
@@ -171,14 +171,19 @@ def blockers_around(
         self_lookup: Traced self-visibility of their own body; None where that is not traced.
     """
     plane_bodies, convex = blockers.blocker_kinds.plane_bodies, blockers.blocker_kinds.convex
+
+    def choose(bodies: tuple[int, ...]) -> tuple[int, ...]:
+        chosen = bodies if of_bodies is None else tuple(number for number in bodies if number in of_bodies)
+        return chosen if set(chosen) - {body} else ()
+
     group_planes = group_parts = None
     self_blocker: GroupConvexParts | SelfLookup | None = self_lookup
-    if chosen := _choose_blocking(plane_bodies, body, of_bodies):
+    if chosen := choose(plane_bodies):
         assert blockers.frames is not None and blockers.body_sides is not None
         self_plane = plane_bodies.index(body) if body in plane_bodies else None
         plane_blockers = blockers.scene_planes.blockers(plane_bodies, chosen)
         group_planes = GroupPlanes(plane_blockers, blockers.frames, plane_bodies, blockers.body_sides, self_plane)
-    if chosen := _choose_blocking(convex, body, of_bodies):
+    if chosen := choose(convex):
         assert blockers.placed_parts is not None
         group_parts = GroupConvexParts(blockers.scene_parts.blockers(convex, chosen), blockers.placed_parts, convex)
     if body in blockers.blocker_kinds.solids and len(blockers.scene_parts.parts[body]) > 1:  # one alone blocks none
@@ -186,9 +191,3 @@ def blockers_around(
         parts_of_body = blockers.scene_parts.blockers(convex, (body,))
         self_blocker = GroupConvexParts(parts_of_body, blockers.placed_parts, on_surface=True)
     return GroupBlockers(spheres, group_planes, group_parts, self_blocker, blockers.body_sides if body >= 0 else None)
-
-
-def _choose_blocking(bodies: tuple[int, ...], body: int, of_bodies: Iterable[int] | None) -> tuple[int, ...]:
-    """Bodies of one kind that block light around a body, () if none but itself does."""
-    chosen = bodies if of_bodies is None else tuple(number for number in bodies if number in of_bodies)
-    return chosen if set(chosen) - {body} else ()

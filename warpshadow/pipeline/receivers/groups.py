@@ -49,16 +49,13 @@ class BlockersOfKind(Protocol):
 class CoveringBlockers(BlockersOfKind, Protocol):
     """Blockers of a kind whose share of each cell of directions is known."""
 
-    def coverage(
-        self, group: Group, directions: np.ndarray, radius: float | None = None, samples: np.ndarray | None = None
-    ) -> wp.array:
+    def coverage(self, group: Group, directions: np.ndarray, radius: float | None = None) -> wp.array:
         """Coverage (h, μ) of cells, vec4 of shape [batch, receiver, direction].
 
         Args:
             group: The receivers.
             directions: Of the cells, [direction, 3].
             radius: Of cells that do not tile the sphere [rad]; None for those that do.
-            samples: Directions drawn from the light of each cell, [direction, 8, 3], by which a kind may be more exact.
         Differentiable: arrays of the group, and of the blockers.
         """
 
@@ -89,25 +86,17 @@ class GroupSpheres(NamedTuple):
         """Transmittance of cells, with the options of :func:`.directional.transmittance`: how soft edges are."""
         from warpshadow.stages.visibility.directional import transmittance
 
-        return transmittance(
-            group.points,
-            group.horizon_normals,
-            self.centers,
-            self.radii,
-            directions,
-            body_spans=group.spans,
-            skips=self.skips(group.spans),
-            clusters=self.clusters,
-            **options,
-        )
+        arguments = group.points, group.horizon_normals, self.centers, self.radii, directions
+        options |= {"body_spans": group.spans, "skips": self.skips(group.spans), "clusters": self.clusters}
+        return transmittance(*arguments, **options)
 
     def log_transmittance(self, group: Group, samples: PlacedSamples, span: EmitterSpan, emitter: int) -> wp.array:
         """Logarithm of the transmittance to an emitter, see :class:`BlockersOfKind`."""
         from warpshadow.stages.emitters.sphere_transmittance import find_log_transmittance
 
         skipped = self.skip(group.body), self.ranges.get(emitter, (0, 0))
-        arguments = group.points, group.normals, samples, span, self.centers, self.radii, skipped
-        return find_log_transmittance(*arguments)
+        spheres = self.centers, self.radii
+        return find_log_transmittance(group.points, group.normals, samples, span, *spheres, skipped)
 
     def expanded(self, instances: int) -> GroupSpheres:
         """Repeat spheres of a batch of 1 for every instance. Differentiable: centers, radii."""
@@ -130,41 +119,40 @@ class GroupPlanes(NamedTuple):
         """Where they are."""
         return {"planes": self.frames}
 
-    def coverage(
-        self, group: Group, directions: np.ndarray, radius: float | None = None, samples: np.ndarray | None = None
-    ) -> wp.array:
-        """Coverage of cells, see :class:`CoveringBlockers`; of their light where samples are given and planes open."""
+    def coverage(self, group: Group, directions: np.ndarray, radius: float | None = None) -> wp.array:
+        """Coverage of cells, see :class:`CoveringBlockers`."""
         from warpshadow.stages.planes.coverage import plane_coverage
+
+        arguments = group.fronts_of_planes.lifted_points, self.frames, self.blockers, directions
+        coverage = plane_coverage(*arguments, radius=radius, **self._options(group))
+        assert coverage is not None  # planes besides their own are around the receivers
+        return coverage
+
+    def coverage_of_light(
+        self, group: Group, coverage: wp.array, directions: np.ndarray, samples: np.ndarray
+    ) -> wp.array:
+        """Coverage of the light of cells, whose coverage is known, see :func:`.coverage_of_light`."""
         from warpshadow.stages.planes.partial_cells import coverage_of_light
 
-        front_weights, points = group.fronts_of_planes
-        options: dict[str, Any] = {
+        arguments = group.fronts_of_planes.lifted_points, coverage, self.frames, self.blockers, directions, samples
+        return coverage_of_light(*arguments, **self._options(group))
+
+    def _options(self, group: Group) -> dict[str, Any]:
+        return {
             "horizon_normals": group.horizon_normals,
-            "front_weights": front_weights,
+            "front_weights": group.fronts_of_planes.front_weights,
             "self_plane": self.self_plane,
         }
-        coverage = plane_coverage(points, self.frames, self.blockers, directions, radius=radius, **options)
-        assert coverage is not None  # others than their own are around the receivers
-        if samples is None or not self.blockers.has_holes:
-            return coverage
-        return coverage_of_light(points, coverage, self.frames, self.blockers, directions, samples, **options)
 
     def log_transmittance(self, group: Group, samples: PlacedSamples, span: EmitterSpan, emitter: int) -> wp.array:
         """Logarithm of the transmittance to an emitter, see :class:`BlockersOfKind`."""
         from warpshadow.stages.emitters.plane_transmittance import find_log_transmittance_of_planes
 
+        receivers = group.fronts_of_planes.lifted_points, group.normals
+        planes = self.frames, self.blockers, self.body_sides.sides_of(self.frames, self.blockers)
         emitter_plane = self.bodies.index(emitter) if emitter in self.bodies else -1
-        return find_log_transmittance_of_planes(
-            group.fronts_of_planes.lifted_points,
-            group.normals,
-            samples,
-            span,
-            self.frames,
-            self.blockers,
-            self.body_sides.sides_of(self.frames, self.blockers),
-            emitter,
-            (-1 if self.self_plane is None else self.self_plane, emitter_plane),
-        )
+        skipped = -1 if self.self_plane is None else self.self_plane, emitter_plane
+        return find_log_transmittance_of_planes(*receivers, samples, span, *planes, emitter, skipped)
 
 
 class GroupConvexParts(NamedTuple):
@@ -180,18 +168,11 @@ class GroupConvexParts(NamedTuple):
         """Where they are."""
         return {"parts": self.placed_parts.corners}
 
-    @property
-    def is_of_one_body(self) -> bool:
-        """Whether it serves the receivers of one body alone, whose light its own parts block."""
-        return self.on_surface
-
     def _number_of(self, body: int | None) -> int:
         """The number that a body has here; −1 for none."""
         return self.bodies.index(body) if body in self.bodies else -1
 
-    def coverage(
-        self, group: Group, directions: np.ndarray, radius: float | None = None, samples: np.ndarray | None = None
-    ) -> wp.array:
+    def coverage(self, group: Group, directions: np.ndarray, radius: float | None = None) -> wp.array:
         """Coverage of cells, see :class:`CoveringBlockers` and :func:`.part_coverage`."""
         return part_coverage(
             group.points,
@@ -210,8 +191,8 @@ class GroupConvexParts(NamedTuple):
         from warpshadow.stages.emitters.convex_transmittance import find_log_transmittance_of_parts
 
         skipped = self._number_of(group.body), self._number_of(emitter)
-        arguments = group.points, group.normals, samples, span, self.placed_parts, self.blockers, skipped
-        return find_log_transmittance_of_parts(*arguments)
+        parts = self.placed_parts, self.blockers
+        return find_log_transmittance_of_parts(group.points, group.normals, samples, span, *parts, skipped)
 
 
 class GroupBlockers(NamedTuple):
@@ -242,10 +223,6 @@ class GroupBlockers(NamedTuple):
         """Where the blockers of all kinds are, by name."""
         placed = [blockers.placed_arrays for blockers in self if blockers is not None]
         return {name: array for arrays in placed for name, array in arrays.items()}
-
-    def expanded(self, instances: int) -> GroupBlockers:
-        """The blockers, with the spheres repeated for every instance. Differentiable: spheres."""
-        return self if self.spheres is None else self._replace(spheres=self.spheres.expanded(instances))
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,7 +284,9 @@ class Group:
         placed_arrays, size, group = self.blockers.placed_arrays, self.points.shape[1], self
         if placed_arrays:
             count = common_batch({"points": self.points, **placed_arrays})
-            group = self._with_arrays(lambda array: expand(array, count), blockers=self.blockers.expanded(count))
+            spheres = self.blockers.spheres and self.blockers.spheres.expanded(count)
+            blockers = self.blockers._replace(spheres=spheres)
+            group = self._with_arrays(lambda array: expand(array, count), blockers=blockers)
         is_whole = self.cached_rows is not None or size <= RECEIVERS_AT_ONCE
         if is_whole or varies([self.points, self.normals, *placed_arrays.values()]):
             yield group

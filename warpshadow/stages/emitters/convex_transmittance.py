@@ -38,7 +38,7 @@ class PlacedPartArrays:
 
     arrays: ConvexArrays
     corners: wp.array(dtype=wp.vec3)
-    planes: wp.array(dtype=wp.vec4)
+    face_planes: wp.array(dtype=wp.vec4)
     bounds: wp.array(dtype=wp.vec4)
 
 
@@ -67,9 +67,9 @@ class Border:
 
 
 @wp.func
-def _sees(planes: wp.array(dtype=wp.vec4), face: int, point: wp.vec3, margin: float):
+def _sees(face_planes: wp.array(dtype=wp.vec4), face: int, point: wp.vec3, margin: float):
     """Whether a point is before a face."""
-    plane = planes[face]
+    plane = face_planes[face]
     return wp.dot(wp.vec3(plane[0], plane[1], plane[2]), point) - plane[3] > -margin
 
 
@@ -83,8 +83,8 @@ def _nearest_border(parts: PlacedPartArrays, part: int, beam: Beam):
     min_sine = float(wp.inf)
     for e in range(parts.arrays.first_edge[part], parts.arrays.first_edge[part + 1]):
         edge = parts.arrays.edges[e]
-        sees_left = _sees(parts.planes, first_face + edge[2], beam.point, margin)
-        if sees_left != _sees(parts.planes, first_face + edge[3], beam.point, margin):
+        sees_left = _sees(parts.face_planes, first_face + edge[2], beam.point, margin)
+        if sees_left != _sees(parts.face_planes, first_face + edge[3], beam.point, margin):
             side = wp.where(sees_left, -1.0, 1.0)
             vector = wp.cross(parts.corners[edge[0]] - beam.point, parts.corners[edge[1]] - beam.point)
             sine = side * wp.dot(wp.normalize(vector), beam.offset)
@@ -95,8 +95,8 @@ def _nearest_border(parts: PlacedPartArrays, part: int, beam: Beam):
     nearest_face = int(-1)
     min_depth = float(wp.inf)
     for face in range(first_face, parts.arrays.first_face[part + 1]):
-        if _sees(parts.planes, face, beam.point, margin):
-            plane = parts.planes[face]
+        if _sees(parts.face_planes, face, beam.point, margin):
+            plane = parts.face_planes[face]
             depth = plane[3] - wp.dot(wp.vec3(plane[0], plane[1], plane[2]), beam.point + beam.offset)
             if depth < min_depth:
                 min_depth = depth
@@ -166,7 +166,7 @@ class BeamInputs:
     first_sample: int
     is_two_sided: int
     corners: wp.array2d(dtype=wp.vec3)
-    planes: wp.array2d(dtype=wp.vec4)
+    face_planes: wp.array2d(dtype=wp.vec4)
     bounds: wp.array2d(dtype=wp.vec4)
     arrays: ConvexArrays
     skipped: wp.vec2i
@@ -203,7 +203,7 @@ def _find_receiver(inputs: BeamInputs, batch: int, index: int):
     part_batch = instance_in(batch, inputs.bounds.shape[0])
     receiver.parts.arrays = inputs.arrays
     receiver.parts.corners = inputs.corners[part_batch]
-    receiver.parts.planes = inputs.planes[part_batch]
+    receiver.parts.face_planes = inputs.face_planes[part_batch]
     receiver.parts.bounds = inputs.bounds[part_batch]
     return receiver
 
@@ -376,7 +376,7 @@ def find_log_transmittance_of_parts(
     inputs.points, inputs.normals = points, normals
     inputs.sample_points, inputs.sample_areas, inputs.balls = samples.points, samples.areas, samples.balls
     inputs.emitter, inputs.first_sample, inputs.is_two_sided = span.emitter, span.first, int(span.is_two_sided)
-    inputs.corners, inputs.planes, inputs.bounds = placed_parts
+    inputs.corners, inputs.face_planes, inputs.bounds = placed_parts
     inputs.arrays, inputs.skipped = blockers.arrays, wp.vec2i(*skipped)
     return launch_with_adjoint(
         _block_by_compounds,

@@ -21,7 +21,7 @@ No receiver is nearer to a side than a margin, so that t is not 0. :mod:`.fronts
 height alone the weight of the front falls from 1 in the plane to 0 a margin below it, where the back has 1.
 """
 
-import weakref
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import warp as wp
@@ -56,8 +56,7 @@ def check_planes(
         check.choice("self_plane", self_plane, range(planes.count))
 
 
-_ARRAYS: weakref.WeakKeyDictionary[PlaneBlockers, dict[tuple[float, int | None], PlaneArrays]]
-_ARRAYS = weakref.WeakKeyDictionary()  # for as long as the planes live
+_ARRAYS: WeakKeyDictionary[PlaneBlockers, dict[tuple[float, int | None], PlaneArrays]] = WeakKeyDictionary()
 
 
 def plane_arrays(planes: PlaneBlockers, radius: float, self_plane: int | None) -> PlaneArrays:
