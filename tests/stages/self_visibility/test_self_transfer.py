@@ -10,7 +10,7 @@ from warpshadow.maths import sh
 from warpshadow.maths.directions import fibonacci
 from warpshadow.stages.light.transfer import sh_product
 from warpshadow.stages.self_visibility.probes import ProbeWeights
-from warpshadow.stages.self_visibility.self_transfer import find_body_rotation, project_rows, self_visibility_lobes
+from warpshadow.stages.self_visibility.self_transfer import find_body_rotation, find_self_transfer, project_rows
 from warpshadow.stages.self_visibility.trace import VisibilityRows
 
 pytestmark = pytest.mark.usefixtures("poisoned_outputs")
@@ -61,7 +61,7 @@ class Case:
 
     def found(self, bands=None) -> wp.array:
         turned = find_body_rotation(self.on_device, 1, self.order)
-        return self_visibility_lobes(self.rows, self.places, turned, order=self.order, bands=bands)
+        return find_self_transfer(self.rows, self.places, turned, order=self.order, bands=bands)
 
     def expected(self, rotations: np.ndarray) -> np.ndarray:
         own = np.einsum("brj,brjk->brk", self.weights, self.lobes[self.numbers])

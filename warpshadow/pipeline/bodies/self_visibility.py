@@ -50,8 +50,8 @@ from warpshadow.stages.self_visibility.probes import (
 from warpshadow.stages.self_visibility.self_transfer import (
     BodyRotation,
     find_body_rotation,
+    find_self_transfer,
     project_rows,
-    self_visibility_lobes,
 )
 from warpshadow.stages.self_visibility.sun_cells import RayProbes
 from warpshadow.stages.self_visibility.trace import (
@@ -103,28 +103,28 @@ class SelfVisibilityLookup(NamedTuple):
         )
 
 
-class SelfVisibilityLobes(NamedTuple):
-    """Self-visibility of a body where light is in harmonics: its lobes, and how they are turned."""
+class SelfTransfer(NamedTuple):
+    """Self-visibility of a body where light is in harmonics: self-transfer of its probes, and its rotation."""
 
-    lobes: wp.array  # [row, order²]
-    turn: BodyRotation
+    probe_transfer: wp.array  # [row, order²]
+    rotation: BodyRotation
 
     @property
     def placed_arrays(self) -> Mapping[str, wp.array]:
         """The part that depends on the rotations."""
-        return {"rotations": self.turn.rotations}
+        return {"rotations": self.rotation.rotations}
 
     @property
     def is_of_one_body(self) -> bool:
-        """True: lobes are turned by the rotation of their body."""
+        """True: self-transfer is rotated with its body."""
         return True
 
     def of_receivers(self, weights: ProbeWeights, *, order: int, bands: int | None = None) -> wp.array:
-        """Lobes that their body leaves receivers, [batch, receiver, bands²]; by default all bands of an order."""
-        return self_visibility_lobes(self.lobes, weights, self.turn, order=order, bands=bands)
+        """Self-transfer of receivers, [batch, receiver, bands²]; by default all bands of an order."""
+        return find_self_transfer(self.probe_transfer, weights, self.rotation, order=order, bands=bands)
 
 
-SelfLookup = SelfVisibilityLookup | SelfVisibilityLobes
+SelfLookup = SelfVisibilityLookup | SelfTransfer
 """Self-visibility of receivers, in cells or in bands."""
 
 
@@ -143,7 +143,7 @@ class SelfVisibility:
         self._tables: dict[tuple[int, ...], ProbeTables] = {}
         self._rows: dict[int, VisibilityRows] = {}
         self._bodies_with_backs: set[int] = set()  # open ones whose backs have rows
-        self._lobes: dict[tuple[int, int], wp.array] = {}
+        self._probe_transfer: dict[tuple[int, int], wp.array] = {}
         self._body_tables: dict[tuple[int, ...], BodyTables] = {}
 
     # ----------------------------------------------------------------------------------- kind of self-shadow
@@ -291,20 +291,20 @@ class SelfVisibility:
         build = functools.partial(build_face_tree, self.probes(body).positions, faces, self._merged_scene.device)
         return self._cached_by_mesh(body, "tree", build)
 
-    def turned_lobes(self, bodies: tuple[int, ...], rotations: wp.array, order: int) -> dict[int, SelfVisibilityLobes]:
-        """The lobes of bodies in bands of spherical harmonics, and how they are turned. Differentiable: rotations."""
+    def self_transfer_of(self, bodies: tuple[int, ...], rotations: wp.array, order: int) -> dict[int, SelfTransfer]:
+        """Self-transfer of bodies in bands of spherical harmonics, rotated with them. Differentiable: rotations."""
         self._announce(bodies)
         return {
-            body: SelfVisibilityLobes(self._lobes_of(body, order), find_body_rotation(rotations, body, order))
+            body: SelfTransfer(self._probe_transfer_of(body, order), find_body_rotation(rotations, body, order))
             for body in bodies
             if not self._merged_scene.is_flat[body]
         }
 
-    def _lobes_of(self, body: int, order: int) -> wp.array:
-        if (body, order) not in self._lobes:
+    def _probe_transfer_of(self, body: int, order: int) -> wp.array:
+        if (body, order) not in self._probe_transfer:
             self._trace_backs(body)
-            self._lobes[body, order] = project_rows(self.rows(body), self._normals(body), order)
-        return self._lobes[body, order]
+            self._probe_transfer[body, order] = project_rows(self.rows(body), self._normals(body), order)
+        return self._probe_transfer[body, order]
 
     def missing(self, bodies: tuple[int, ...]) -> int:
         """Number of bodies, of some, without rows in memory yet."""

@@ -13,7 +13,7 @@ from warpshadow.device.constants import constant
 from warpshadow.device.memory import zeros
 from warpshadow.pipeline.bodies.blockers import BlockerKinds
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
-from warpshadow.pipeline.bodies.self_visibility import SelfVisibilityLobes
+from warpshadow.pipeline.bodies.self_visibility import SelfTransfer
 from warpshadow.pipeline.node import Input
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.static import StaticBodies, VertexRows
@@ -64,9 +64,9 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
 
     def self_lookups(
         self, bodies: tuple[int, ...], rotations: wp.array, projected_light: ProjectedBands
-    ) -> dict[int, SelfVisibilityLobes]:
-        """The lobes of some bodies, turned. Differentiable: rotations."""
-        return self.scene_blockers.self_visibility.turned_lobes(bodies, rotations, self._order)
+    ) -> dict[int, SelfTransfer]:
+        """Self-transfer of some bodies. Differentiable: rotations."""
+        return self.scene_blockers.self_visibility.self_transfer_of(bodies, rotations, self._order)
 
     def find_visibility(self, group: Group, projected_light: ProjectedBands) -> HarmonicVisibility:
         """Visibility, float32 of shape [batch, receiver, order²]; None where nothing blocks."""
@@ -84,38 +84,39 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
 
     def find_transfer(self, visibility: HarmonicVisibility, group: Group, projected_light: ProjectedBands) -> wp.array:
         """Transfer vectors, float32 of shape [batch, receiver, bands²]."""
-        lobes = self._self_visibility_lobes(visibility, group, projected_light)
-        if lobes is None:
+        self_transfer = self._self_transfer(visibility, group, projected_light)
+        if self_transfer is None:
             return sh_transfer(visibility.coefficients, group.normals, order=self._order, bands=projected_light.bands)
         if visibility.coefficients is None:
-            return lobes
+            return self_transfer
         # where cameras share the rotations, but not the receivers
-        lobes = expand_rows(lobes, len(visibility.coefficients))
-        return sh_product(visibility.coefficients, lobes, order=self._order, bands=projected_light.bands)
+        self_transfer = expand_rows(self_transfer, len(visibility.coefficients))
+        return sh_product(visibility.coefficients, self_transfer, order=self._order, bands=projected_light.bands)
 
-    def _self_visibility_lobes(
+    def _self_transfer(
         self, visibility: HarmonicVisibility, group: Group, projected_light: ProjectedBands
     ) -> wp.array | None:
-        """Lobes that receivers' own bodies leave, [batch, receiver, order²]; only the light's bands if nothing blocks.
+        """Self-transfer of receivers, [batch, receiver, order²]; only the light's bands if nothing blocks.
 
-        None where they are clamped cosines.
+        None where it is the clamped cosine.
         """
         if group.cached_rows is not None and group.cached_rows.rows.shape[1] == 2:
             assert visibility.coefficients is not None
-            lobes = zeros(visibility.coefficients.shape, dtype=wp.float32, device=visibility.coefficients.device)
-            add_rows(group.cached_rows, lobes, channel=1)
-            return lobes
+            shape, device = visibility.coefficients.shape, visibility.coefficients.device
+            self_transfer = zeros(shape, dtype=wp.float32, device=device)
+            add_rows(group.cached_rows, self_transfer, channel=1)
+            return self_transfer
         lookup = group.blockers.self_blocker
-        if not isinstance(lookup, SelfVisibilityLobes):
+        if not isinstance(lookup, SelfTransfer):
             return None
         bands = projected_light.bands if visibility.coefficients is None else self._order
         return lookup.of_receivers(group.probe_weights, order=self._order, bands=bands)
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
-        """The log-visibility of the static spheres, for any light, [row, 1, order²]; and lobes, if one has its own."""
+        """The log-visibility of the static spheres, for any light, [row, 1, order²]; and self-transfer of bodies."""
         if any(body in blocker_kinds.self_traced for body in static_bodies.bodies):
             find = functools.partial(self._accumulate_and_turn, blocker_kinds.self_traced)
-            return static_bodies.rows(("log sums and lobes", blocker_kinds.self_traced), find)
+            return static_bodies.rows(("log sums and self-transfer", blocker_kinds.self_traced), find)
         return static_bodies.rows("log sums", self._accumulate)
 
     def _accumulate(self, static_bodies: StaticBodies, vertices: np.ndarray, normals: wp.array) -> wp.array:
@@ -125,22 +126,22 @@ class LogSH(SphereMethod[ProjectedBands, HarmonicVisibility]):
     def _accumulate_and_turn(
         self, traced: tuple[int, ...], static_bodies: StaticBodies, vertices: np.ndarray, normals: wp.array
     ) -> wp.array:
-        """Log sums of the spheres of other bodies, and lobes, [vertex, 2, order²]."""
+        """Log sums of the spheres of other bodies, and self-transfer, [vertex, 2, order²]."""
         assert static_bodies.rotations is not None
         body_of_vertex, device = self.merged_scene.body_of_vertex, self.merged_scene.device
         rows = np.empty((len(vertices), 2, self._order**2), np.float32)
         bodies = body_of_vertex[vertices % len(body_of_vertex)]
         traced_bodies = tuple(np.intersect1d(traced, bodies).tolist())
         self_visibility = self.scene_blockers.self_visibility
-        turned = self_visibility.turned_lobes(traced_bodies, static_bodies.rotations, self._order)
+        self_transfer_of_bodies = self_visibility.self_transfer_of(traced_bodies, static_bodies.rotations, self._order)
         for body in np.unique(bodies).tolist():
             chosen_rows = np.flatnonzero(bodies == body)
             arguments = static_bodies.gathered(vertices[chosen_rows], normals)
             others = [other for other in static_bodies.bodies if not (other == body and body in traced)]
             rows[chosen_rows, 0] = self._logs(*arguments, *static_bodies.spheres_of(others)).numpy()[0]
-            if body in turned:
+            if body in self_transfer_of_bodies:
                 weights = self_visibility.probe_weights_of(body, vertices[chosen_rows])
-                result = turned[body].of_receivers(weights, order=self._order)
+                result = self_transfer_of_bodies[body].of_receivers(weights, order=self._order)
             else:
                 result = sh_transfer(None, arguments[1], order=self._order)
             rows[chosen_rows, 1] = result.numpy()[0]

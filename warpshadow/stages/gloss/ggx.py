@@ -39,7 +39,7 @@ def masking(cosine: float, lambda_of_light: float, view_cosine: float, lambda_of
 
 
 @wp.func
-def reflect(normal_cosine: float, cosine: float, view_cosine: float, square: float):
+def specular_brdf(normal_cosine: float, cosine: float, view_cosine: float, square: float):
     """D V of mirrors of the width √square, given n·h, n·l and n·v."""
     ellipsoid = normal_cosine * normal_cosine * (square - 1.0) + 1.0
     density = square / (wp.pi * ellipsoid * ellipsoid)
@@ -49,7 +49,7 @@ def reflect(normal_cosine: float, cosine: float, view_cosine: float, square: flo
 
 
 class LaneGgx(NamedTuple):
-    """The same of as many directions at once as there are lanes."""
+    """Functions of GGX for as many directions at once as there are lanes."""
 
     stretch: Any  # W (x, y)
     smith_lambda: Any  # of a stretched vector

@@ -18,7 +18,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.stages.emitters.samples import EmitterSpan, PlacedSamples, facing_area, may_light, sample_transmittance
-from warpshadow.stages.gloss.ggx import fresnel_weight, reflect
+from warpshadow.stages.gloss.ggx import fresnel_weight, specular_brdf
 from warpshadow.stages.gloss.lobes import MAX_COSINE, MIN_COSINE, MIN_ROUGHNESS
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.raster.project import eye_position
@@ -74,7 +74,7 @@ def _sum_highlights(
             mirror = wp.normalize(view + beam / distance)
             square = wp.min(rough * rough * rough * rough + solid_angle / (4.0 * wp.pi), 1.0)
             weight = cosine * solid_angle * sample_transmittance(transmittance, batch, receiver, i)
-            weight = weight * reflect(wp.dot(normal, mirror), cosine, view_cosine, square)
+            weight = weight * specular_brdf(wp.dot(normal, mirror), cosine, view_cosine, square)
             light = weight * radiance[radiance_batch, first_sample + i]
             sum_f0 += light
             sum_f90 += fresnel_weight(wp.dot(view, mirror)) * light

@@ -227,22 +227,22 @@ def _make_sh_product(order: int, lanes: int) -> wp.Kernel:
     return multiply_sh
 
 
-def sh_product(visibility: wp.array, lobes: wp.array, *, order: int, bands: int | None = None) -> wp.array:
-    """Transfer vectors of lobes that are not the clamped cosine: (V * K)_k.
+def sh_product(visibility: wp.array, self_transfer: wp.array, *, order: int, bands: int | None = None) -> wp.array:
+    """Transfer vectors of receivers with self-transfer, in place of the clamped cosine: (V * K)_k.
 
     Args:
         visibility: V, float32 of shape [batch, receiver, order²].
-        lobes: K, float32 of shape [batch, receiver, order²].
+        self_transfer: K, float32 of shape [batch, receiver, order²].
         order: Number of SH bands, 2 to 8.
         bands: As for :func:`sh_transfer`.
     Returns:
         Transfer vectors, float32 of shape [batch, receiver, bands²].
-    Differentiable: visibility, lobes.
+    Differentiable: visibility, self_transfer.
     """
     sh.check_order(order)
     bands = order if bands is None else bands
     check.choice("bands", bands, range(1, order + 1))
-    check.shape("lobes", lobes.shape, visibility.shape)
+    check.shape("self_transfer", self_transfer.shape, visibility.shape)
     device, (batch_count, receiver_count, _) = visibility.device, visibility.shape
     lanes = lane_count(device)
     row_count = batch_count * block_count(receiver_count, lanes)
@@ -257,18 +257,21 @@ def sh_product(visibility: wp.array, lobes: wp.array, *, order: int, bands: int 
             cost=2 * PRODUCT_COST * lanes * order**2 * bands**2,
         )
 
+    def forward(transfer: wp.array) -> None:
+        add_product(visibility, self_transfer, product_table(order, str(device), None, bands), transfer)
+
     def adjoint(adj: wp.array) -> None:
         """Γ is symmetric:  V̄ = K * T̄  and  K̄ = V * T̄."""
         table = product_table(order, str(device), tuple(range(bands)))
-        for factor, other in ((visibility, lobes), (lobes, visibility)):
+        for factor, other in ((visibility, self_transfer), (self_transfer, visibility)):
             if factor.requires_grad:
                 add_product(other, adj, table, factor.grad)
 
     return differentiable(
-        lambda transfer: add_product(visibility, lobes, product_table(order, str(device), None, bands), transfer),
+        forward,
         adjoint,
         result=zeros((batch_count, receiver_count, bands**2), dtype=wp.float32, device=device),
-        variables=[visibility, lobes],
+        variables=[visibility, self_transfer],
     )
 
 

@@ -1,4 +1,4 @@
-"""Self-visibility lobes: SH light that a probe gets past its own body, computed once in the body's frame.
+"""Self-transfer: transfer vectors of probes past their own body, in SH, computed once in the body's frame.
 
     L_k = 1/π ∫ S(ω) max(n·ω, 0) y_k(ω) dω
 
@@ -34,11 +34,11 @@ _ROWS_PER_CHUNK = 1 << 9  # rows that are projected at once
 
 
 def project_rows(rows: VisibilityRows, normals: np.ndarray, order: int) -> wp.array:
-    """Find the lobes of probes: the lobes of open probes, minus the light of blocked rays.
+    """Find the self-transfer of probes: the clamped cosine of open probes, minus the light of blocked rays.
 
     Args:
         rows: Visibility of the probes past their body.
-        normals: Their unit normals in the frame of the body [row, 3]; a zero normal has no lobe.
+        normals: Their unit normals in the frame of the body [row, 3]; a zero normal has none.
     Returns:
         L, float32 of shape [row, order²]. Not differentiable.
     """
@@ -47,14 +47,14 @@ def project_rows(rows: VisibilityRows, normals: np.ndarray, order: int) -> wp.ar
     ray_light = (4 / len(rays) * sh.evaluate(order, rays)).astype(np.float32)
     band = sh.band_of(order)
     zonal = (sh.clamped_cosine(order) / np.pi * np.sqrt(4 * np.pi / (2 * np.arange(order) + 1)))[band]
-    lobes = (zonal * sh.evaluate(order, normals)).astype(np.float32)
-    lobes[~normals.any(axis=1)] = 0
+    probe_transfer = (zonal * sh.evaluate(order, normals)).astype(np.float32)
+    probe_transfer[~normals.any(axis=1)] = 0
     for start in range(0, len(normals), _ROWS_PER_CHUNK):
         row_slice = slice(start, start + _ROWS_PER_CHUNK)
         is_open = bits[row_slice, :, None] >> np.arange(32, dtype=np.uint32) & 1
         cosines = np.maximum(normals[row_slice].astype(np.float32) @ rays.T.astype(np.float32), 0)
-        lobes[row_slice] -= np.where(is_open.reshape(cosines.shape), 0, cosines) @ ray_light
-    return wp.array(lobes, dtype=wp.float32, device=rows.bits.device)
+        probe_transfer[row_slice] -= np.where(is_open.reshape(cosines.shape), 0, cosines) @ ray_light
+    return wp.array(probe_transfer, dtype=wp.float32, device=rows.bits.device)
 
 
 @functools.cache
@@ -122,7 +122,7 @@ class BodyRotation(NamedTuple):
 
 
 def find_body_rotation(rotations: wp.array, body: int, order: int) -> BodyRotation:
-    """Find a body's rotation of harmonics. Differentiable: rotations, in :func:`self_visibility_lobes`."""
+    """Find a body's rotation of harmonics. Differentiable: rotations, in :func:`find_self_transfer`."""
     batch_count, device = len(rotations), rotations.device
     directions, weights = sh.quadrature(2 * order - 2)
     weighted_basis = constant(
@@ -142,77 +142,77 @@ def find_body_rotation(rotations: wp.array, body: int, order: int) -> BodyRotati
 
 
 @wp.func
-def _self_coefficient(lobes: wp.array2d(dtype=wp.float32), row: wp.vec3i, corner_weights: wp.vec3, i: int):
+def _self_coefficient(probe_transfer: wp.array2d(dtype=wp.float32), row: wp.vec3i, corner_weights: wp.vec3, i: int):
     """Coefficient i of a receiver, in the body's frame."""
     if row[0] == row[1] and row[0] == row[2]:
-        return lobes[row[0], i]
+        return probe_transfer[row[0], i]
     return (
-        corner_weights[0] * lobes[row[0], i]
-        + corner_weights[1] * lobes[row[1], i]
-        + corner_weights[2] * lobes[row[2], i]
+        corner_weights[0] * probe_transfer[row[0], i]
+        + corner_weights[1] * probe_transfer[row[1], i]
+        + corner_weights[2] * probe_transfer[row[2], i]
     )
 
 
 @wp.kernel(enable_backward=False)
-def _rotate_lobes(
+def _rotate_transfer(
     first_row: int,
     worker: int,
     # in
-    lobes: wp.array2d(dtype=wp.float32),
+    probe_transfer: wp.array2d(dtype=wp.float32),
     rows: wp.array2d(dtype=wp.vec3i),
     probe_weights: wp.array2d(dtype=wp.vec3),
     harmonic_rotations: wp.array3d(dtype=wp.float32),
     bands: int,
     # out
-    rotated_lobes: wp.array3d(dtype=wp.float32),
+    self_transfer: wp.array3d(dtype=wp.float32),
 ):
     """A thread owns a receiver."""
-    batch, receiver = split_row(first_row + wp.tid(), rotated_lobes.shape[1])
+    batch, receiver = split_row(first_row + wp.tid(), self_transfer.shape[1])
     rotation_batch = instance_in(batch, harmonic_rotations.shape[0])
     row = rows[instance_in(batch, rows.shape[0]), receiver]
     corner_weights = probe_weights[instance_in(batch, probe_weights.shape[0]), receiver]
     for k in range(bands * bands):
-        rotated_lobes[batch, receiver, k] = 0.0
+        self_transfer[batch, receiver, k] = 0.0
     for band in range(bands):
         start = band * band
         end = start + 2 * band + 1
         for i in range(start, end):
-            coefficient = _self_coefficient(lobes, row, corner_weights, i)
+            coefficient = _self_coefficient(probe_transfer, row, corner_weights, i)
             for k in range(start, end):
-                rotated_lobes[batch, receiver, k] = (
-                    rotated_lobes[batch, receiver, k] + harmonic_rotations[rotation_batch, k, i] * coefficient
+                self_transfer[batch, receiver, k] = (
+                    self_transfer[batch, receiver, k] + harmonic_rotations[rotation_batch, k, i] * coefficient
                 )
 
 
 @wp.kernel(enable_backward=False)
-def _rotate_lobes_adjoint(
+def _rotate_transfer_adjoint(
     first_row: int,
     worker: int,
     # in
-    lobes: wp.array2d(dtype=wp.float32),
+    probe_transfer: wp.array2d(dtype=wp.float32),
     rows: wp.array2d(dtype=wp.vec3i),
     harmonic_rotations: wp.array3d(dtype=wp.float32),
     bands: int,
-    rotated_lobes: wp.array3d(dtype=wp.float32),
+    self_transfer: wp.array3d(dtype=wp.float32),
     generator_starts: wp.array(dtype=wp.int32),
     generator_columns: wp.array(dtype=wp.int32),
     generators: wp.array(dtype=wp.vec3),
-    adj_rotated_lobes: wp.array3d(dtype=wp.float32),
+    adj_self_transfer: wp.array3d(dtype=wp.float32),
     # out
     adj_probe_weights: wp.array2d(dtype=wp.vec3),
     # sums
     adj_angles: wp.array(dtype=wp.vec3),
 ):
     """A thread owns a receiver:  δ̄_a += K̄ᵀ G_a K,  b̄_j += L_jᵀ Dᵀ K̄."""
-    batch, receiver = split_row(first_row + wp.tid(), adj_rotated_lobes.shape[1])
+    batch, receiver = split_row(first_row + wp.tid(), adj_self_transfer.shape[1])
     rotation_batch = instance_in(batch, harmonic_rotations.shape[0])
     if adj_angles:
         adj_angle = wp.vec3()
         for k in range(bands * bands):
             generated = wp.vec3()
             for t in range(generator_starts[k], generator_starts[k + 1]):
-                generated += rotated_lobes[batch, receiver, generator_columns[t]] * generators[t]
-            adj_angle += adj_rotated_lobes[batch, receiver, k] * generated
+                generated += self_transfer[batch, receiver, generator_columns[t]] * generators[t]
+            adj_angle += adj_self_transfer[batch, receiver, k] * generated
         wp.atomic_add(adj_angles, rotation_batch, adj_angle)
     if adj_probe_weights:
         row = rows[instance_in(batch, rows.shape[0]), receiver]
@@ -223,8 +223,10 @@ def _rotate_lobes_adjoint(
             for i in range(start, end):
                 adj_coefficient = float(0.0)
                 for k in range(start, end):
-                    adj_coefficient += harmonic_rotations[rotation_batch, k, i] * adj_rotated_lobes[batch, receiver, k]
-                adj_weights += adj_coefficient * wp.vec3(lobes[row[0], i], lobes[row[1], i], lobes[row[2], i])
+                    adj_coefficient += harmonic_rotations[rotation_batch, k, i] * adj_self_transfer[batch, receiver, k]
+                adj_weights += adj_coefficient * wp.vec3(
+                    probe_transfer[row[0], i], probe_transfer[row[1], i], probe_transfer[row[2], i]
+                )
         adj_probe_weights[batch, receiver] = adj_probe_weights[batch, receiver] + adj_weights
 
 
@@ -255,13 +257,18 @@ def _generator_rows(order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     )
 
 
-def self_visibility_lobes(
-    lobes: wp.array, probe_weights: ProbeWeights, rotation: BodyRotation, *, order: int, bands: int | None = None
+def find_self_transfer(
+    probe_transfer: wp.array,
+    probe_weights: ProbeWeights,
+    rotation: BodyRotation,
+    *,
+    order: int,
+    bands: int | None = None,
 ) -> wp.array:
-    """Find the lobes of receivers of a body.
+    """Find the self-transfer of receivers of a body.
 
     Args:
-        lobes: L of its probes, float32 of shape [row, order²].
+        probe_transfer: L of its probes, float32 of shape [row, order²].
     Returns:
         K, float32 of shape [batch, receiver, bands²].
     Differentiable: the body's rotation, as it turns on; weights of the probes.
@@ -269,18 +276,18 @@ def self_visibility_lobes(
     bands = order if bands is None else bands
     rotations, body, harmonic_rotations = rotation
     batch_count = common_batch({"probe_weights": probe_weights.rows, "rotations": harmonic_rotations})
-    shape, device = (batch_count, probe_weights.rows.shape[1], bands**2), lobes.device
+    shape, device = (batch_count, probe_weights.rows.shape[1], bands**2), probe_transfer.device
     if probe_weights.weights.requires_grad:
         # each instance has a gradient of its own
         probe_weights = ProbeWeights(probe_weights.rows, expand(probe_weights.weights, batch_count))
-    rotated_lobes = empty(shape, dtype=wp.float32, device=device)
+    self_transfer = empty(shape, dtype=wp.float32, device=device)
     cost = _ROTATION_COST * bands**3
 
     def forward(result: wp.array) -> None:
-        inputs = [lobes, *probe_weights, harmonic_rotations, bands]
-        launch(_rotate_lobes, shape[0] * shape[1], inputs=inputs, outputs=[result], cost=cost)
+        inputs = [probe_transfer, *probe_weights, harmonic_rotations, bands]
+        launch(_rotate_transfer, shape[0] * shape[1], inputs=inputs, outputs=[result], cost=cost)
 
-    def adjoint(adj_rotated_lobes: wp.array) -> None:
+    def adjoint(adj_self_transfer: wp.array) -> None:
         first, index, vectors = _generator_rows(bands)
         generators = (
             constant(values, dtype, device)
@@ -290,16 +297,16 @@ def self_visibility_lobes(
         if rotations.requires_grad:
             adj_angles = zeros(len(rotations), dtype=wp.vec3, device=device)
         launch(
-            _rotate_lobes_adjoint,
+            _rotate_transfer_adjoint,
             shape[0] * shape[1],
             inputs=[
-                lobes,
+                probe_transfer,
                 probe_weights.rows,
                 harmonic_rotations,
                 bands,
-                rotated_lobes,
+                self_transfer,
                 *generators,
-                adj_rotated_lobes,
+                adj_self_transfer,
             ],
             outputs=[probe_weights.weights.grad],
             sums=[adj_angles],
@@ -309,4 +316,4 @@ def self_visibility_lobes(
             inputs = [adj_angles, rotations, body]
             launch(_add_rotation_gradients, len(rotations), inputs=inputs, outputs=[rotations.grad])
 
-    return differentiable(forward, adjoint, result=rotated_lobes, variables=[probe_weights.weights, rotations])
+    return differentiable(forward, adjoint, result=self_transfer, variables=[probe_weights.weights, rotations])
