@@ -4,9 +4,12 @@ from typing import NamedTuple
 
 import warp as wp
 
-from warpshadow.device.lanes import Chunk, as_chunks, use_vector_registers
-from warpshadow.device.launch import launch
+from warpshadow.device.lanes import Chunk, as_chunks, total_of_chunk, use_vector_registers
+from warpshadow.device.launch import launch, launch_with_adjoint
 from warpshadow.device.memory import empty, require_gradient
+from warpshadow.device.parallel import split_row
+
+_CELL_COST = 2.0  # nanoseconds that a cell of a receiver takes
 
 
 class CachedRows(NamedTuple):
@@ -16,20 +19,10 @@ class CachedRows(NamedTuple):
     index: wp.array  # [receiver] int32
 
 
-@wp.func
-def _sum_cells(transmittance: Chunk, red: Chunk, green: Chunk, blue: Chunk):
-    """Light of a chunk of cells:  Σ_q T_q S_q."""
-    return wp.vec3(wp.dot(transmittance, red), wp.dot(transmittance, green), wp.dot(transmittance, blue))
-
-
-@wp.func_grad(_sum_cells)
-def _sum_cells_adjoint(transmittance: Chunk, red: Chunk, green: Chunk, blue: Chunk, adj_light: wp.vec3):
-    """The gradient to transmittance alone, by the vector units:  T̄_q = S_q · B̄."""
-    wp.adjoint[transmittance] += adj_light[0] * red + adj_light[1] * green + adj_light[2] * blue
-
-
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _shade_cells(
+    first_row: int,
+    worker: int,
     # in
     transmittance: wp.array3d(dtype=Chunk),
     index: wp.array(dtype=wp.int32),
@@ -38,14 +31,42 @@ def _shade_cells(
     shading: wp.array2d(dtype=wp.vec3),
 ):
     """A thread owns a receiver."""
-    batch, receiver = wp.tid()
+    batch, receiver = split_row(first_row + wp.tid(), shading.shape[1])
     row = index[receiver]
-    irradiance = wp.vec3()
+    red = Chunk(0.0)
+    green = Chunk(0.0)
+    blue = Chunk(0.0)
     for chunk in range(cells.shape[2]):
-        irradiance += _sum_cells(
-            transmittance[batch, receiver, chunk], cells[row, 0, chunk], cells[row, 1, chunk], cells[row, 2, chunk]
+        t = transmittance[batch, receiver, chunk]
+        red += wp.cw_mul(t, cells[row, 0, chunk])
+        green += wp.cw_mul(t, cells[row, 1, chunk])
+        blue += wp.cw_mul(t, cells[row, 2, chunk])
+    shading[batch, receiver] = wp.vec3(total_of_chunk(red), total_of_chunk(green), total_of_chunk(blue))
+
+
+@wp.kernel(enable_backward=False)
+def _shade_cells_adjoint(
+    first_row: int,
+    worker: int,
+    # in
+    transmittance: wp.array3d(dtype=Chunk),
+    index: wp.array(dtype=wp.int32),
+    cells: wp.array3d(dtype=Chunk),
+    adj_shading: wp.array2d(dtype=wp.vec3),
+    # out
+    adj_transmittance: wp.array3d(dtype=Chunk),
+):
+    """A thread owns a receiver:  T̄_q += S_q · B̄."""
+    batch, receiver = split_row(first_row + wp.tid(), adj_shading.shape[1])
+    row = index[receiver]
+    adj = adj_shading[batch, receiver]
+    for chunk in range(cells.shape[2]):
+        adj_transmittance[batch, receiver, chunk] = (
+            adj_transmittance[batch, receiver, chunk]
+            + adj[0] * cells[row, 0, chunk]
+            + adj[1] * cells[row, 1, chunk]
+            + adj[2] * cells[row, 2, chunk]
         )
-    shading[batch, receiver] = irradiance
 
 
 def shade_cached_cells(transmittance: wp.array, cached: CachedRows) -> wp.array:
@@ -60,10 +81,18 @@ def shade_cached_cells(transmittance: wp.array, cached: CachedRows) -> wp.array:
     """
     device = transmittance.device
     use_vector_registers(__name__, device)
-    shading = empty(transmittance.shape[:2], dtype=wp.vec3, device=device)
-    inputs = [as_chunks(transmittance), cached.index, as_chunks(cached.rows)]
-    launch(_shade_cells, shading.shape, inputs=inputs, outputs=[shading])
-    return shading
+    batch_count, receiver_count, direction_count = transmittance.shape
+    chunks = as_chunks(transmittance)
+    return launch_with_adjoint(
+        _shade_cells,
+        _shade_cells_adjoint,
+        batch_count * receiver_count,
+        inputs=[chunks, cached.index, as_chunks(cached.rows)],
+        result=empty((batch_count, receiver_count), dtype=wp.vec3, device=device),
+        variables=[chunks],
+        cost=_CELL_COST * direction_count,
+        adj_cost=_CELL_COST * direction_count,
+    )
 
 
 @wp.kernel
