@@ -141,7 +141,7 @@ def draw_in_cells(radiance: np.ndarray, directions: np.ndarray, cells: np.ndarra
 
 
 def without_spots(radiance: np.ndarray, spots: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Make a map without the light near some spots, at least that of the pixel that each spot is in.
+    """Make a map without the light near some spots, at least without the pixel that each spot is in.
 
     Args:
         radiance: As for :func:`gather_cells`.

@@ -134,15 +134,15 @@ class Mesh:
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the box around the vertices that faces refer to, each shape [3]."""
-        used = self.world_points()
-        return used.min(axis=0), used.max(axis=0)
+        points = self.world_points()
+        return points.min(axis=0), points.max(axis=0)
 
     def world_points(self) -> np.ndarray:
         """The vertices that faces refer to [scene units], float32 of shape [point, 3]."""
-        return self.positions[self._used]
+        return self.positions[self._referenced_vertices]
 
     @functools.cached_property
-    def _used(self) -> np.ndarray:
+    def _referenced_vertices(self) -> np.ndarray:
         """Vertices that faces refer to, rising."""
         return np.unique(self.faces)
 
@@ -250,7 +250,7 @@ class Mesh:
         is_creased = self.origins is not None  # on purpose
         if is_creased or not topology.draws_lines(self.surface, self.positions):
             return 0
-        return len(self._used) - len(self.welded()._used)
+        return len(self._referenced_vertices) - len(self.welded()._referenced_vertices)
 
     @functools.cached_property
     def rounds_edges(self) -> bool:

@@ -218,9 +218,11 @@ def _weld_corners(part: MeshPart) -> MeshPart:
     vertex_attributes = [] if part.colors is None else [part.colors]
     is_first = topology.is_listed_first(part.positions, part.faces)  # edges of the others would have too many faces
     remark = "" if is_first.all() else f"{np.sum(~is_first)} duplicate faces dropped"
-    used, faces = np.unique(weld(part.faces[is_first], part.positions, *vertex_attributes), return_inverse=True)
-    positions, faces = part.positions[used], faces.reshape(-1, 3)
-    colors = None if part.colors is None else part.colors[used]
+    first_vertices, faces = np.unique(
+        weld(part.faces[is_first], part.positions, *vertex_attributes), return_inverse=True
+    )
+    positions, faces = part.positions[first_vertices], faces.reshape(-1, 3)
+    colors = None if part.colors is None else part.colors[first_vertices]
     surface = topology.join_faces(positions, faces, None)
     if topology.rounds_edges(surface, positions):
         faces, origins = topology.part_at_creases(faces, surface, positions, topology.CREASE)
@@ -268,8 +270,8 @@ def _trimesh_part(shape, of_file: bool, factors: gltf.Factors) -> MeshPart:
     else:  # normals of meshes that were changed differ a little at seams
         stored_normals = [] if normals is None else [normals if of_file else joined_normals(positions, normals)]
         welded_vertices = weld(faces, positions, *vertex_attributes, *stored_normals)
-    lost = len(np.unique(faces)) - len(np.unique(welded_vertices))
-    return part._replace(faces=welded_vertices, uvs=uvs, uv_faces=None if uvs is None else faces, welded=lost)
+    welded_count = len(np.unique(faces)) - len(np.unique(welded_vertices))
+    return part._replace(faces=welded_vertices, uvs=uvs, uv_faces=None if uvs is None else faces, welded=welded_count)
 
 
 def _stored_normals(shape: trimesh.Trimesh) -> np.ndarray | None:

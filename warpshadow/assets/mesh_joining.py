@@ -38,7 +38,7 @@ def join_parts(parts: list[MeshPart], name: str) -> JoinedMesh:
     positions, faces = stack((part.positions, part.faces) for part in parts)
     textured = [(part.uvs, part.uv_faces) for part in parts if part.uvs is not None]
     uvs, uv_faces = stack(textured) if len(textured) == len(parts) else (None, None)
-    used = np.unique(checked_indices("faces", faces, len(positions), "vertex"))
+    referenced_vertices = np.unique(checked_indices("faces", faces, len(positions), "vertex"))
     is_first = is_listed_first(positions, faces)  # here, so that one warning has all remarks
     own_uv_faces = None if uv_faces is None else uv_faces[is_first]
     mesh = Mesh(positions, faces[is_first], uvs, own_uv_faces, name, colors=_joined_colors(parts))
@@ -47,7 +47,7 @@ def join_parts(parts: list[MeshPart], name: str) -> JoinedMesh:
     counts = {
         "degenerate faces (no area)": np.sum(~normals.any(axis=1)),
         "duplicate faces dropped": np.sum(~is_first),
-        "unreferenced vertices": mesh.vertex_count - len(used) - sum(part.welded for part in parts),
+        "unreferenced vertices": mesh.vertex_count - len(referenced_vertices) - sum(part.welded for part in parts),
     }
     remarks = [f"{count} {fault}" for fault, count in counts.items() if count]
     remarks += [part.remark for part in parts if part.remark]

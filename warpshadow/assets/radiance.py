@@ -100,7 +100,7 @@ def _decode_pixels(data: bytes, start: int, width: int) -> tuple[np.ndarray, int
     source = np.maximum.accumulate(np.where(is_run, -1, index))
     shift = np.minimum(8 * (index - source - 1), 24)
     counts = np.where(is_run, pixels[:, 3].astype(np.int64) << np.maximum(shift, 0), 1)
-    used = int(np.searchsorted(np.cumsum(counts), width)) + 1
-    if counts[:used].sum() != width or source[0] < 0:
+    run_count = int(np.searchsorted(np.cumsum(counts), width)) + 1
+    if counts[:run_count].sum() != width or source[0] < 0:
         raise ValueError("the line has another width")
-    return pixels[np.repeat(source[:used], counts[:used])], start + 4 * used
+    return pixels[np.repeat(source[:run_count], counts[:run_count])], start + 4 * run_count

@@ -19,14 +19,14 @@ def welded(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
     The first of each stays, in order: so split vertices become one again.
     """
-    used = np.unique(faces)
-    position_ids = number_positions(positions[used])
+    referenced_vertices = np.unique(faces)
+    position_ids = number_positions(positions[referenced_vertices])
     _, first, position_index = np.unique(position_ids, return_index=True, return_inverse=True)
     first_vertices = np.sort(first)
     number = np.searchsorted(first_vertices, first)[position_index]
     renumbered = np.zeros(len(positions), np.int32)
-    renumbered[used] = number
-    return positions[used[first_vertices]], renumbered[faces]
+    renumbered[referenced_vertices] = number
+    return positions[referenced_vertices[first_vertices]], renumbered[faces]
 
 
 def join_at_positions(positions: np.ndarray, faces: np.ndarray, *attributes: np.ndarray) -> np.ndarray:

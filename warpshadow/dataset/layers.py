@@ -66,9 +66,9 @@ class Layer(NamedTuple):
 LAYERS = {
     "color": Layer(LazyLayers.color, Srgb()),
     "shadow": Layer(LazyLayers.shadow, Even(8)),
-    "depth": Layer(lambda shown: shown.some("Z"), Even(16)),
-    "normals": Layer(lambda shown: shown.some("N.X", "N.Y", "N.Z"), Even(8, low=-128 / 127)),  # 128 is 0
-    "bodies": Layer(lambda shown: shown.some("body"), Even(8, low=-1, high=254)),
+    "depth": Layer(lambda image_layers: image_layers.some("Z"), Even(16)),
+    "normals": Layer(lambda image_layers: image_layers.some("N.X", "N.Y", "N.Z"), Even(8, low=-128 / 127)),  # 128 is 0
+    "bodies": Layer(lambda image_layers: image_layers.some("body"), Even(8, low=-1, high=254)),
     "masks": Layer(LazyLayers.masks, Even(8), is_apart=True),
 }
 """The layers, by the names that recipes have for them."""

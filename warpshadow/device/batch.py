@@ -35,7 +35,7 @@ def common_batch(arrays: Mapping[str, Any]) -> int:
 
 @wp.func
 def instance_in(batch: int, count: int):
-    """Index of an instance in an array that has ``count`` of them: its own, or that of the one that serves all."""
+    """Index of an instance in an array that has ``count`` of them: its own, or 0 where one serves all."""
     return wp.min(batch, count - 1)
 
 

@@ -70,7 +70,7 @@ def immutable(values: np.ndarray) -> np.ndarray:
 
 
 class IdentityKey:
-    """A key that equals those of the same object only, which it holds."""
+    """A key that holds an object, and equals keys of the same object only."""
 
     __slots__ = ("_value",)
 

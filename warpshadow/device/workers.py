@@ -162,7 +162,7 @@ def answer(
     dumps: Dumps = pickle.dumps,
     caught: type[BaseException] = BaseException,
 ) -> bytes:
-    """Do a task that was packed, and pickle its result and its error; that of sys.exit(), too, is only the task's."""
+    """Do a task that was packed, and pickle its result and its error; sys.exit(), too, ends only the task."""
     try:
         result = function(pickle.loads(packed_task))
     except caught as error:

@@ -128,7 +128,7 @@ def check_writable(path: Path) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Raise OSError unless a folder is new, or that of a fit."""
+    """Raise OSError unless a folder is new, or a fit's."""
     check_writable(path)
     if not path.is_dir() or has_checkpoint(path):
         return

@@ -176,7 +176,7 @@ class QuasiNewton(torch.optim.Optimizer):
         return (torch.from_numpy(factors).to(vectors) @ vectors * scales).to(downhill)
 
     def _scales(self, steps: torch.Tensor, changes: torch.Tensor) -> torch.Tensor:
-        """Scale of each value, that of its tensor: 1/√(curvature of the tensor), [value].
+        """Scale of each value, the same over its tensor: 1/√(curvature of the tensor), [value].
 
         For a curvature matrix H, whose diagonal block of the tensor is H_t, a step s and a change y = H s,
 

@@ -76,7 +76,7 @@ class ProjectedModel(Model):
         return torch.cat(images)
 
     def design(self, values: Mapping[str, Values], emitted: torch.Tensor | float = 0.0) -> torch.Tensor:
-        """Images by single atoms and single lamps, less those by other emitters: [atom, view, height, width, 3]."""
+        """Images by single atoms and single lamps, less images by other emitters: [atom, view, height, width, 3]."""
         world = self.world(values)
         coefficients = torch.eye(self.light.basis.size, device=self.context.device)[..., None].expand(-1, -1, 3)
         images = self._images_by_lights(world, coefficients.contiguous()) - emitted
@@ -89,7 +89,7 @@ class ProjectedModel(Model):
         return torch.cat([images, lamps * units[:, None, None, None, None]])
 
     def solve(self, values: Mapping[str, Values]) -> None:
-        """Set light and lamps to those of the least loss, for the other values."""
+        """Set light and lamps to their values of the least loss, for the other values."""
         emitted = self.emitted(values)
         design = self.design(values, emitted).permute(4, 0, 1, 2, 3).flatten(2)  # [color, atom, pixel]
         target = ((self.targets[..., :3] - emitted) / self.context.unit).permute(3, 0, 1, 2).flatten(1)

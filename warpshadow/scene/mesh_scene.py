@@ -111,7 +111,7 @@ def default_scene(
 
 
 def _standing_share(points: np.ndarray, middle: np.ndarray, axis: int) -> float:
-    """Area on which points stand, as a part of that of their shadow from above; 0 where they would fall over."""
+    """Area on which points stand, over the area of their shadow from above; 0 where they would fall over."""
     from scipy.spatial import ConvexHull, QhullError
 
     level = np.delete(points, axis, axis=1)

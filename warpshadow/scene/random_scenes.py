@@ -160,7 +160,7 @@ class DrawnScene(NamedTuple):
     scene: Scene
     """The bodies, the last one the ground; light and camera."""
     prototypes: tuple[int, ...]
-    """Which of the given bodies each is, from 0; that of the ground is left out."""
+    """Which of the given bodies each is, from 0; the ground's is left out."""
     light: DrawnLight | None
     """None where maps are not given."""
 
@@ -265,8 +265,8 @@ def _random_bodies(
     widest = max(_footprint(body) for body in bodies)
     ring = 0.0 if count == 1 else _draw_between(rng, ranges.gap) * widest / np.sin(np.pi / count)
     angles = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / count
-    places = ring * np.stack([np.cos(angles), np.zeros(count), np.sin(angles)], axis=1)
-    pairs = zip(bodies, places, strict=True)
+    positions = ring * np.stack([np.cos(angles), np.zeros(count), np.sin(angles)], axis=1)
+    pairs = zip(bodies, positions, strict=True)
     return [replace(body, translation=body.translation + place) for body, place in pairs], chosen
 
 

@@ -105,7 +105,7 @@ def _check_order(settings: Mapping[str, object]) -> None:
 
 
 def _argument_role(value: object, name: str) -> str:
-    """The argument of a scene that a value is meant for; that of the name where it is of no such class."""
+    """The argument of a scene that a value is meant for; by its name where it is of no such class."""
     items = value if isinstance(value, (list, tuple)) else [value]
     if any(isinstance(item, Body) for item in items):
         return "bodies"
@@ -313,7 +313,7 @@ class Scene:
 
     @functools.cached_property
     def direction_count(self) -> int:
-        """Cells of "directional": as many as are asked for, or as many as :data:`DIRECTIONS` and those below it say.
+        """Cells of "directional": as many as asked for, or as many as :data:`DIRECTIONS` and constants below it say.
 
         Roughness and emission that calls of a renderer pass do not count, nor those that a fit finds.
         """

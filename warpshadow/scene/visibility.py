@@ -73,7 +73,7 @@ SHARED_DIRECTIONS = 512
 """Directions that receivers share unless ``samples`` says how many: with 256 edges of dim shadows show as streaks."""
 
 DIRECTIONS, DIRECTIONS_OF_GLOSS = 128, 256
-"""Cells unless ``directions`` says how many: of scenes that are diffuse or rough, and of those with a body below …"""
+"""Cells unless ``directions`` says how many: of scenes that are diffuse or rough, and of scenes with a body below …"""
 
 NARROW_ROUGHNESS = 0.3
 """… this roughness. A metal ball of roughness 0.2 on a ground is 9.2, 6.0 and 3.9% off with 128, 256 and 512 cells."""
@@ -167,7 +167,7 @@ class Visibility:
 
     @property
     def traits(self) -> MethodTraits:
-        """Of the method; where none is named, of that of renderers."""
+        """Of the method; where none is named, of the renderers' method."""
         return METHOD_TRAITS[self.method or DEFAULT_METHOD]
 
     @property

@@ -61,10 +61,10 @@ def _wall(light: EnvironmentMap, side: str, edges: np.ndarray, center: np.ndarra
     axis, sign = "xyz".index(side[1]), 1.0 if side[0] == "+" else -1.0
     axis_u, axis_v = (axis + 1) % 3, (axis + 2) % 3
 
-    def on_wall(places: np.ndarray) -> np.ndarray:
+    def on_wall(wall_positions: np.ndarray) -> np.ndarray:
         """Points of the wall, from the middle of the box, of places from -0.5 to 0.5, [..., 2]."""
-        points = np.full((*places.shape[:-1], 3), 0.5 * sign * edges[axis])
-        points[..., axis_u], points[..., axis_v] = np.moveaxis(places * edges[[axis_u, axis_v]], -1, 0)
+        points = np.full((*wall_positions.shape[:-1], 3), 0.5 * sign * edges[axis])
+        points[..., axis_u], points[..., axis_v] = np.moveaxis(wall_positions * edges[[axis_u, axis_v]], -1, 0)
         return points
 
     def radiance(row: int) -> np.ndarray:

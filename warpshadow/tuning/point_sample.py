@@ -1,4 +1,4 @@
-"""Points that a camera sees, at which the shading of a setting is compared with that of rays through the meshes."""
+"""Points that a camera sees, at which the shading of a setting is compared with shading by rays through the meshes."""
 
 import functools
 from collections.abc import Sequence

@@ -98,6 +98,6 @@ def rotation(wxyz: tuple[float, ...] | np.ndarray) -> Rotation:
     return Rotation.from_quat(np.roll(np.asarray(wxyz, np.float64), -1))
 
 
-def quaternion(turned: Rotation) -> np.ndarray:
+def quaternion(rotation: Rotation) -> np.ndarray:
     """A rotation as a page is told it, w first, shape [4]."""
-    return np.roll(turned.as_quat(), 1)
+    return np.roll(rotation.as_quat(), 1)

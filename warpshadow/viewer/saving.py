@@ -57,9 +57,9 @@ def as_toml(path: Path, scene: Scene, viewer_state: ViewerState, camera: Camera)
 
 def as_archive(scene: Scene, viewer_state: ViewerState, camera: Camera) -> bytes:
     """A ZIP archive of the scene file and all that it names."""
-    shown = dataclasses.replace(viewer_state.scene(scene), camera=camera)
+    shown_scene = dataclasses.replace(viewer_state.scene(scene), camera=camera)
     packed = io.BytesIO()
     with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path in write_scene(shown, folder):
+        for path in write_scene(shown_scene, folder):
             archive.write(path, path.relative_to(folder))
     return packed.getvalue()

@@ -115,7 +115,7 @@ class Free(abc.ABC):
         return {}
 
     def report(self, context: FitContext, fitted: FittedScene) -> list[tuple[str, str]]:
-        """Lines of a report, name and value, beside those of the fields of bodies that changed."""
+        """Lines of a report, name and value, beside the lines of changed fields of bodies."""
         return []
 
     def regularizer(self, values: Values, context: FitContext) -> torch.Tensor | None:

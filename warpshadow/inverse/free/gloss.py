@@ -48,7 +48,7 @@ class _Gloss(FreeOfSurface):
 @check.frozen()
 @dataclass(frozen=True)
 class Roughness(_Gloss):
-    """Roughness of a glossy body; its arguments are those of :class:`.FreeOfSurface`."""
+    """Roughness of a glossy body; arguments as of :class:`.FreeOfSurface`."""
 
     key = "roughness"
 
@@ -56,6 +56,6 @@ class Roughness(_Gloss):
 @check.frozen()
 @dataclass(frozen=True)
 class Metallic(_Gloss):
-    """Metallic share of a glossy body; its arguments are those of :class:`.FreeOfSurface`."""
+    """Metallic share of a glossy body; arguments as of :class:`.FreeOfSurface`."""
 
     key = "metallic"

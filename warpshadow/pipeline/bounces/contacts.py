@@ -17,8 +17,8 @@ class _Surface:
     """A body's surface in the world."""
 
     def __init__(self, body: Body, *, device: wp.DeviceLike):
-        used, faces = np.unique(body.mesh.surface.faces, return_inverse=True)
-        self.points, self.faces = body.to_world(body.mesh.positions[used]), faces.reshape(-1, 3)
+        referenced_vertices, faces = np.unique(body.mesh.surface.faces, return_inverse=True)
+        self.points, self.faces = body.to_world(body.mesh.positions[referenced_vertices]), faces.reshape(-1, 3)
         self.low, self.high = self.points.min(axis=0), self.points.max(axis=0)
         self.half_size = float((self.high - self.low).max()) / 2
         self._device = device

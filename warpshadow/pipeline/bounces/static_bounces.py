@@ -179,7 +179,7 @@ class StaticBounces:
     def _factors(
         self, points: ShadingContext, materials: Materials, senders: Senders, at_patch_samples: Node | None = None
     ) -> Node:
-        """Node of the form factors, which are those of any light: that of patch samples tells where rays are sent."""
+        """Node of the form factors, the same in any light: light at patch samples tells where rays are sent."""
         if not self._is_still or materials is not points.materials:  # form factors of a fit must not follow its light
             at_patch_samples = None
 

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 RAYS = 1024  # rays of a cache point or patch sample, which find its form factors …
 
 STILL_RAYS = 256
-"""… and those of a still, which has no time to spare: of the table of demos/kinds.py (128²) it has an error of 1.95%
+"""… and for a still, which has no time to spare: of the table of demos/kinds.py (128²) it has an error of 1.95%
 against paths with these, and of 1.93% with 1024, in 3.1 and 7.1 s of CPU time."""
 
 _BRIGHT_PART = 4
@@ -185,13 +185,13 @@ def _split_by_bodies(factors: csr_matrix, body_of_patch: np.ndarray) -> list[csr
     entries = factors.tocoo()
     is_same_body = np.equal(*(body_of_patch[patches] for patches in entries.coords))
     return [
-        coo_matrix((entries.data[which], (entries.row[which], entries.col[which])), entries.shape)
-        for which in (is_same_body, ~is_same_body)
+        coo_matrix((entries.data[is_chosen], (entries.row[is_chosen], entries.col[is_chosen])), entries.shape)
+        for is_chosen in (is_same_body, ~is_same_body)
     ]
 
 
 def _ray_origins(receivers: Receivers, positions: wp.array, senders: Senders) -> np.ndarray:
-    """Points from which rays of receivers leave, [view, receiver, 3]: where walls meet, within that of a vertex."""
+    """Points from which rays of receivers leave, [view, receiver, 3], inset at vertices (:mod:`.maths.inset`)."""
     points, vertices = receivers.points.numpy().copy(), positions.numpy()[0]
     if receivers.receiver_of_vertex is None:  # of points that are given
         return points
@@ -205,7 +205,7 @@ def _ray_origins(receivers: Receivers, positions: wp.array, senders: Senders) ->
 def _bright_patches(
     light: wp.array, albedo: wp.array, mesh: wp.Mesh, patch_of_sides: np.ndarray, senders: Senders, *, rays: int
 ) -> BrightPatches:
-    """Patches that reflect much direct light, given that of patch samples, vec3 of shape [batch, patch sample]."""
+    """Patches that reflect much direct light, given light at patch samples, vec3 of shape [batch, patch sample]."""
     radiosity = albedo.numpy().mean(axis=0) * (senders.mean.to_scipy() @ light.numpy().mean(axis=0))
     radiosity = np.concatenate([radiosity, np.zeros((len(BLACK_ENTRIES), 3))])
     corners = mesh.points.numpy().reshape(-1, 3, 3).astype(np.float64)
@@ -218,7 +218,7 @@ def _mesh(positions: np.ndarray, senders: Senders) -> tuple[wp.Mesh, np.ndarray]
     After all patches follow the entries BLACK_ENTRIES, for surfaces that send nothing.
     """
     merged_scene = senders.merged_scene
-    corners, owners, count = [], [], len(senders.areas)
+    corners, patches_of_sides, count = [], [], len(senders.areas)
     for number, body in enumerate(merged_scene.scene.bodies):
         body_positions = positions[merged_scene.first_vertex[number] : merged_scene.first_vertex[number + 1]]
         faces = body.mesh.surface.faces
@@ -233,5 +233,5 @@ def _mesh(positions: np.ndarray, senders: Senders) -> tuple[wp.Mesh, np.ndarray]
             corners.append(body_positions[faces])
             patch_of_side = np.full((2, len(faces)), -1)
         black_entry = np.array([0, 0 if merged_scene.is_two_sided[number] else 1])
-        owners.append(np.where(patch_of_side < 0, count + black_entry[:, None], patch_of_side))
-    return loose_mesh(np.concatenate(corners), device=merged_scene.device), np.concatenate(owners, axis=1)
+        patches_of_sides.append(np.where(patch_of_side < 0, count + black_entry[:, None], patch_of_side))
+    return loose_mesh(np.concatenate(corners), device=merged_scene.device), np.concatenate(patches_of_sides, axis=1)

@@ -1,4 +1,4 @@
-"""Transmittance in lobes by the directional method: that of the cells of receivers on bodies that shine."""
+"""Transmittance in lobes by the directional method, from the cells of receivers on bodies that shine."""
 
 import functools
 

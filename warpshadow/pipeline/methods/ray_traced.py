@@ -169,13 +169,13 @@ class RayTraced(Method):
     ) -> wp.array:
         points, shells = _checked_points(receivers.points), _shells(receivers, shell)
         samples = sample_map(light.radiance, self._sample_count)
-        traced = wp.empty(_batch_shape(points, shells), dtype=wp.vec3, device=points.device)
-        instances = _instances(traced, meshes, points, receivers.normals, shells)
+        shading = wp.empty(_batch_shape(points, shells), dtype=wp.vec3, device=points.device)
+        instances = _instances(shading, meshes, points, receivers.normals, shells)
         for result, mesh, origins, normals, instance_shell in instances:
             wp.copy(
                 result, trace_shading(mesh, origins, normals, samples, shell=instance_shell, progress=self.progress)
             )
-        return traced
+        return shading
 
     def _shade_shared(
         self, trees: list[FaceTree], receivers: Receivers, light: KnownLight, shell: wp.array | None = None
@@ -183,8 +183,8 @@ class RayTraced(Method):
         """Shading by rays in directions that all receivers share, or to points of a shell."""
         points, shells = _checked_points(receivers.points), _shells(receivers, shell)
         count = -(-self.visibility.ray_count // PACKET) * PACKET
-        traced = wp.empty(_batch_shape(points, shells), dtype=wp.vec3, device=points.device)
-        instances = _instances(traced, trees, points, receivers.normals, shells)
+        shading = wp.empty(_batch_shape(points, shells), dtype=wp.vec3, device=points.device)
+        instances = _instances(shading, trees, points, receivers.normals, shells)
         for instance, (result, tree, origins, normals, instance_shell) in enumerate(instances):
             # a ratio image has the same directions with the bodies and without
             share_finder = None
@@ -196,7 +196,7 @@ class RayTraced(Method):
                 corners = find_corners(receivers, instance, self.merged_scene.scene.supersampling)
             trace = functools.partial(trace_shared, shell=instance_shell, progress=self.progress)
             wp.copy(result, trace(tree, origins, normals, samples, corners=corners))
-        return traced
+        return shading
 
     def _transfer(self, meshes: Meshes, receivers: Receivers, shell: wp.array | None = None) -> list[wp.array]:
         points, shells = receivers.points, _shells(receivers, shell)

@@ -79,11 +79,7 @@ class GroupSpheres(NamedTuple):
         return self.ranges[body] if body in self.self_traced and body in self.ranges else (0, 0)
 
     def skips(self, spans: Iterable[Span]) -> list[tuple[int, int]]:
-<<<<<<< ours
-        """The skipped spheres of each span."""
-=======
         """Ranges of spheres that block no light of the receivers of each span."""
->>>>>>> theirs
         return [self.skip(span.body) for span in spans]
 
     def transmittance(self, group: Group, directions: np.ndarray, **options: Any) -> wp.array:

@@ -142,7 +142,7 @@ def _find_values(points: GlossyPoints, materials: Materials, name: str) -> Node:
 
 
 def _interpolate(merged_scene: MergedScene, receivers: Receivers, values: wp.array) -> wp.array:
-    """Interpolate numbers at the receivers between those of vertices."""
+    """Interpolate numbers of vertices at the receivers."""
     samples = receivers.sample_fragments
     assert samples is not None
     if not samples.face_ids.size:

@@ -1,4 +1,4 @@
-"""Bright patches: the few that most light comes from, as those in a lampshade. Rays are sent to them on purpose.
+"""Bright patches: the few that most light comes from, as in a lampshade. Rays are sent to them on purpose.
 
 Rays that are as dense as the cosine find small patches by chance. To N of these, M are added to points of bright
 patches, drawn in proportion to radiosity and area, with a density q by area. Rays of both kinds count alike, by the

@@ -330,7 +330,7 @@ def find_side_hits_adjoint(
     instance: int,
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
-    """Add to gradients of local receivers, viewed edges, and an instance's texels; return that of ``part_coverage``."""
+    """Add to gradients of local receivers, viewed edges, and an instance's texels; return ``part_coverage``'s."""
     adj_part_coverage = wp.vec4()
     for i in range(receiver.side_count):
         if is_hit(hits, i):
@@ -364,7 +364,7 @@ def _visible_radiosity_adjoint(
     instance: int,
     adj_texels: wp.array2d(dtype=wp.vec3),
 ):
-    """Add to the gradients of a local receiver, of a side's open part, and of its texels; return that of the parts."""
+    """Add to the gradients of a local receiver, of a side's open part, and of its texels; return the parts'."""
     adj_part_coverage = wp.vec4()
     hit, adj_radiosity = hits[side.index], adj_hits[side.index].radiosity
     direction = _visible_direction(cell, hit, part_coverage)

@@ -20,7 +20,7 @@ from warpshadow.device.memory import zeros
 from warpshadow.stages.raster.rasterization import Fragments
 
 _RANGE = 0.8
-"""Change of a barycentric within a face: its standard deviation over a triangle is that of a uniform number of a range
+"""Change of a barycentric within a face: it deviates over a triangle as much as a uniform number of a range
 of 0.8."""
 
 _MAX_SQUARE = 1.0  # most of |a|² + |b|²
