@@ -6,7 +6,6 @@ import operator
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
-import numpy as np
 import warp as wp
 
 from warpshadow.assets.known_light import KnownLight
@@ -186,7 +185,7 @@ class SphereMethod(Method, Generic[Projected, FoundVisibility]):
         place = functools.partial(self.scene_blockers.place_blockers, blocker_kinds)
         return find_squares(place, self.share_of_sharpest_light, surfaces)
 
-    def share_of_sharpest_light(self, group: Group) -> np.ndarray | None:
+    def share_of_sharpest_light(self, group: Group) -> wp.array | None:
         """Share of a group's unblocked light that comes from the cells with the sharpest shadows.
 
         Returns:
