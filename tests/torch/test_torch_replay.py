@@ -8,8 +8,6 @@ import torch
 import warp as wp
 
 import warpshadow as ws
-from warpshadow.device import cuda_graph
-from warpshadow.pipeline.views import receiver_finder
 from warpshadow.torch import TorchRenderer
 from warpshadow.torch.replay import Capture
 
@@ -19,10 +17,8 @@ SAME = {"rtol": 1e-5, "atol": 1e-6}
 
 
 @pytest.fixture(autouse=True)
-def on_a_gpu(monkeypatch):
-    """Capture on a CPU, too, and have all vertices as receivers."""
-    monkeypatch.setattr(cuda_graph, "is_captured", lambda device: True)
-    monkeypatch.setattr(receiver_finder, "is_readable", lambda device: False)
+def any_time(monkeypatch):
+    """Replay however long a graph takes."""
     monkeypatch.setattr(Capture, "_seconds_of", lambda capture, run: (run(), 0.0)[1])
 
 
@@ -31,8 +27,9 @@ def make_renderer():
     """Of a ball with known spheres on a ground, 24 × 24 pixels."""
 
     def make(**options) -> TorchRenderer:
-        ball = ws.Body(ws.icosphere(0.5, 2), blockers=SPHERES, translation=(0, 0.5, 0), receivers="vertex")
-        ground = ws.Body(ws.plane(4, 8), receivers="vertex")
+        on_ball, on_ground = options.pop("receivers", ("vertex", "vertex"))
+        ball = ws.Body(ws.icosphere(0.5, 2), blockers=SPHERES, translation=(0, 0.5, 0), receivers=on_ball)
+        ground = ws.Body(ws.plane(4, 8), receivers=on_ground)
         camera = ws.Camera.look_at((0, 2, 3), (0, 0.3, 0), size=(24, 24))
         scene = ws.Scene((ball, ground), ws.synthetic_sky(height=32), camera, ws.Visibility(directions=32))
         bounces = options.pop("bounces", 0)
@@ -40,6 +37,9 @@ def make_renderer():
         return TorchRenderer(dataclasses.replace(scene, bounces=bounces), **options)
 
     return make
+
+
+RECEIVERS = [("vertex", "vertex"), ("pixel", "vertex"), ("vertex", "adaptive"), ("pixel", "adaptive")]
 
 
 def moved(renderer: TorchRenderer, shift: float) -> tuple[torch.Tensor, ...]:
@@ -56,10 +56,13 @@ def image_and_gradients(renderer: TorchRenderer, shift: float, *, light: torch.T
     return [image.detach(), *torch.autograd.grad(image.square().sum(), variables)]
 
 
+@pytest.mark.parametrize("receivers", RECEIVERS)
 @pytest.mark.parametrize("bounces", [0, 2])
 @pytest.mark.parametrize("has_light", [False, True])
-def test_replays_have_the_images_and_gradients_of_plain_calls(bounces, has_light, make_renderer):
-    renderer, plain = make_renderer(bounces=bounces), make_renderer(bounces=bounces, graphs=False)
+def test_replays_have_the_images_and_gradients_of_plain_calls(bounces, has_light, receivers, make_renderer):
+    """They have the same receivers, adaptive ones, too."""
+    options = {"bounces": bounces, "receivers": receivers}
+    renderer, plain = make_renderer(**options), make_renderer(**options, graphs=False)
     for call, shift in enumerate((0.0, 0.1, -0.1, 0.05, 0.2)):
         light = None
         if has_light:
@@ -168,13 +171,27 @@ def test_copies_capture_anew(make_renderer):
     assert other.replays.reason and not renderer.replays.reason
 
 
-def test_on_a_cpu_calls_are_plain(make_renderer, monkeypatch):
-    monkeypatch.undo()
-    renderer = make_renderer()
-    for _ in range(4):
-        renderer(torch.rand(renderer.basis.size, 3))
-    assert renderer.replays.reason == "calls are captured on a GPU alone"
-    assert not wp.get_device("cpu").is_capturing
+@pytest.mark.parametrize("receivers", RECEIVERS)
+def test_an_image_that_shows_more_than_its_graph_has_room_for_is_computed_plainly(receivers, make_renderer):
+    """A ball comes in from the edge of the image; then there is room."""
+    renderer, plain = make_renderer(receivers=receivers), make_renderer(receivers=receivers, graphs=False)
+    reasons = []
+    for shift in (1.5, 1.51, 1.52, 0.0, 0.1):
+        found, expected = image_and_gradients(renderer, shift), image_and_gradients(plain, shift)
+        reasons.append(renderer.replays.reason)
+        torch.testing.assert_close(found, expected, **SAME)
+    assert not reasons[2] and "has room for" in reasons[3] and not reasons[4]
+
+
+def test_calls_that_make_meshes_for_rays_stay_plain_on_a_cpu(make_renderer):
+    """Its graphs do not record that."""
+    scene = make_renderer().scene
+    renderer = TorchRenderer(dataclasses.replace(scene, visibility=ws.Visibility("ray-traced", samples=8)), graphs=True)
+    for shift in (0.1, 0.2, 0.3, 0.1, 0.2, 0.3, 0.4):
+        poses = [pose.detach() for pose in moved(renderer, shift)]
+        assert renderer(geometry=renderer.placed(*poses)).isfinite().all()
+    assert "and no mesh" in renderer.replays.reason
+    assert wp.Mesh.__init__.__name__ == "__init__" and not wp.get_device("cpu").is_capturing
 
 
 def test_no_other_tensor_can_lie_where_the_last_ones_do(make_renderer):

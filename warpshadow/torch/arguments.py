@@ -105,10 +105,10 @@ class Arguments:
         Results lose a batch dimension that no tensor had.
         """
         self._common_batch()
-        find_replay = None
+        find_results = None
         if replays is not None:
             reused = [number for number, name in enumerate(self.names) if name.startswith(_CACHED_BY_VALUE)]
-            find_replay = functools.partial(replays.find, functools.partial(_key, [*inputs]), reused)
+            find_results = functools.partial(replays.results, functools.partial(_key, [*inputs]), reused)
         geometries: list[Geometry[wp.array]] = []
 
         def call(*arrays: wp.array) -> Any:
@@ -118,7 +118,7 @@ class Arguments:
             geometries.append(result)
             return result.all_arrays()
 
-        results = TensorFunction(call, self.dtypes, self.device, self.names, affine, find_replay)(*self.tensors)
+        results = TensorFunction(call, self.dtypes, self.device, self.names, affine, find_results)(*self.tensors)
         if not self._has_batch:
             results = tuple(result[0] for result in results)
         if geometries:

@@ -164,8 +164,8 @@ class TensorFunction:
     """A function of arrays that is applied to tensors, as :func:`apply` says.
 
     Args:
-        find_replay: Finds graphs that compute a call in its place, for tensors and whether a gradient to each is asked
-            for; None if there are none (:mod:`.replay`).
+        find_results: Finds its results for tensors and whether a gradient to each is asked for, by graphs where it can
+            (:mod:`.replay`); None where calls are plain.
     """
 
     function: Callable[..., wp.array | tuple[wp.array, ...]]
@@ -173,7 +173,7 @@ class TensorFunction:
     device: torch.device
     names: Sequence[str]
     affine: Collection[str]
-    find_replay: "Callable[[TensorFunction, Sequence[torch.Tensor], Sequence[bool]], Replay | None] | None" = None
+    find_results: "Callable[[TensorFunction, Sequence[torch.Tensor], Sequence[bool]], CallResults] | None" = None
 
     def __call__(self, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """The results, a tuple also of one."""
@@ -197,10 +197,13 @@ class TensorFunction:
 
     def results(self, tensors: Sequence[torch.Tensor], requires_grad: Sequence[bool]) -> CallResults:
         """The results of a call, replayed where there are graphs for it."""
+        if self.find_results is None:
+            return self.plain_results(tensors, requires_grad)
         with one_call:
-            replay = self.find_replay and self.find_replay(self, tensors, requires_grad)
-            if replay:
-                return replay(tensors)
+            return self.find_results(self, tensors, requires_grad)
+
+    def plain_results(self, tensors: Sequence[torch.Tensor], requires_grad: Sequence[bool]) -> CallResults:
+        """The results of a call that runs the function."""
         arguments = [as_array(*pair) for pair in zip(tensors, self.dtypes, strict=True)]
         with one_call, current_stream(self.device):  # streams are the device's, as Warp has it, not a thread's
             tape, results = self.record(arguments, requires_grad)
@@ -231,9 +234,6 @@ class TensorFunction:
             change = [one - other for one, other in zip(*ends, strict=True)]
             total = [one + other for one, other in zip(total, change, strict=True)] if total else change
         return total
-
-
-Replay: TypeAlias = Callable[[Sequence[torch.Tensor]], CallResults]  # of a call whose graphs are known
 
 
 class _Playback:

@@ -83,8 +83,8 @@ class TorchRenderer(torch.nn.Module):
         device: Device of the tensors and the kernels.
         basis: Basis of free light: ``HarmonicBasis(order)`` or ``CellBasis(directions)``; None for the native basis of
             the scene's method.
-        graphs: Whether calls that come again with tensors of the same shapes are captured as CUDA graphs and replayed
-            on a GPU (:mod:`warpshadow.torch.replay`): tested so far only by captures that tests force on a CPU.
+        graphs: Whether calls that come again with tensors of the same shapes are captured as graphs and replayed where
+            that is faster (:mod:`warpshadow.torch.replay`); on a GPU it has not been tested.
     Attributes:
         replays: The captured calls; ``replays.reason`` says why the last call was not replayed.
         array_renderer: The :class:`warpshadow.Renderer` of Warp's arrays that it calls; most users need it not.

@@ -1,14 +1,15 @@
-"""Replays: calls that come again with tensors of the same shapes are captured as CUDA graphs, forward and backward.
+"""Replays: calls that come again with tensors of the same shapes are captured as graphs, forward and backward.
 
-On a GPU Python takes longer to launch the kernels of a call than they run. So a :class:`TorchRenderer` with
-``graphs=True`` captures a call of a kind that has come twice, and replays it from then on: it copies the tensors to
-where the graph reads them, launches the graph, and copies the results. A kind has shapes, tensors that require a
-gradient, and arguments that are no tensors. Tensors are checked as ever; results in between are not, as in all graphs
-(:mod:`warpshadow.device.cuda_graph`).
+On a GPU Python takes longer to launch the kernels of a call than they run, on a CPU a fifth of an iteration of 256²
+pixels. So a :class:`TorchRenderer` with ``graphs=True`` captures a call of a kind that has come twice, and replays it
+from then on: it copies the tensors to where the graph reads them, launches the graph, and copies the results. A kind
+has shapes, tensors that require a gradient, and arguments that are no tensors. Tensors are checked as ever; results in
+between are not, as in all graphs (:mod:`warpshadow.device.cuda_graph`).
 
-Calls are plain where nothing would be won, or cannot be captured: on a CPU, while torch captures, where geometry or
-cameras without a gradient are the same as before, so that results about them are cached, and where the function reads
-back, and where a graph takes longer. :attr:`Replays.reason` says which it was.
+Calls are plain where nothing would be won, or cannot be captured: while torch captures, where geometry or cameras
+without a gradient are the same as before, so that results about them are cached, where the function reads back, where a
+graph takes longer, and once where an image shows more than the graph has room for
+(:mod:`warpshadow.device.capacities`). :attr:`Replays.reason` says which it was.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from typing import Any
 import torch
 import warp as wp
 
-from warpshadow.device import cuda_graph
+from warpshadow.device.capacities import Capacities
 from warpshadow.device.constants import collecting_constants
+from warpshadow.device.cuda_graph import capture
 from warpshadow.device.tape import unrecorded
 from warpshadow.torch.autograd import (
     CallResults,
-    Replay,
     TensorFunction,
     array_of,
     as_array,
@@ -52,15 +53,15 @@ class Replays:
         """Copies begin anew."""
         return functools.partial(Replays, is_on=self.is_on), ()
 
-    def find(
+    def results(
         self,
         key_of: Callable[[], Hashable],
         reused: Collection[int],
         function: TensorFunction,
         tensors: Sequence[torch.Tensor],
         requires_grad: Sequence[bool],
-    ) -> Replay | None:
-        """Find or make the capture of a call of a function; None if the call is to be plain.
+    ) -> CallResults:
+        """The results of a call of a function, replayed where there is a graph for it.
 
         Args:
             key_of: Makes the key of the arguments of the call but the tensors.
@@ -68,43 +69,49 @@ class Replays:
         """
         self.reason = self._why_plain(function.device)
         if self.reason:
-            return None
+            return function.plain_results(tensors, requires_grad)
         pairs = zip(tensors, requires_grad, strict=True)
         call_key = str(function.device), key_of(), tuple((tuple(tensor.shape), needs) for tensor, needs in pairs)
-        history = self._histories.pop(call_key, None) or _CallHistory()
+        history = self._histories.pop(call_key, None) or _CallHistory(wp.device_from_torch(function.device))
         self._histories[call_key] = history  # the last that was used
         while len(self._histories) > _MAX_HISTORIES:
             del self._histories[next(iter(self._histories))]
         unchanged = [tensors[number] for number in reused if not requires_grad[number]]
-        replay, self.reason = history.find(function, tensors, requires_grad, unchanged)
-        return replay
+        results, self.reason = history.replay(function, tensors, requires_grad, unchanged)
+        if results is None:
+            with history.capacities.used():
+                results = function.plain_results(tensors, requires_grad)
+        return results
 
     def _why_plain(self, device: torch.device) -> str:
         if not self.is_on:
             return "graphs = False"
-        if not cuda_graph.is_captured(wp.device_from_torch(device)):
-            return "calls are captured on a GPU alone"
         return "torch captures the call" if is_capturing(device) else ""
 
 
 class _CallHistory:
-    """Calls that a graph can stand for."""
+    """Calls that a graph can stand for.
 
-    def __init__(self) -> None:
+    Attributes:
+        capacities: The capacities of graphs for sizes that plain calls count.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        self.capacities = Capacities(device)
         self._plain_calls = self._failures = 0
         self._capture: Capture | None = None
         self._failure = ""
         self._unchanged: list[torch.Tensor] = []  # of the last call: held, so that no other lies where they did
         self._versions: list[tuple[int, int]] | None = None  # of these
 
-    def find(
+    def replay(
         self,
         function: TensorFunction,
         tensors: Sequence[torch.Tensor],
         requires_grad: Sequence[bool],
         unchanged: Sequence[torch.Tensor],
-    ) -> tuple[Replay | None, str]:
-        """The replay of the capture, or why there is none."""
+    ) -> tuple[CallResults | None, str]:
+        """The results of a replay, or why there are none."""
         before, self._versions = self._versions, [(tensor.data_ptr(), tensor._version) for tensor in unchanged]
         self._unchanged = [tensor.detach() for tensor in unchanged]
         if unchanged and self._versions == before:
@@ -116,18 +123,22 @@ class _CallHistory:
             return None, "calls of this kind have not come often enough"
         if self._capture is None:
             try:
-                capture = Capture(function, tensors, requires_grad)
+                capture = Capture(function, tensors, requires_grad, self.capacities)
             except (RuntimeError, MemoryError) as error:  # such as for a constant that is missing: plain calls make it
                 self._plain_calls, self._failures = 0, self._failures + 1
                 self._failure = f"it cannot be captured: {error}"
                 return None, self._failure
-            if capture.seconds > capture.plain_seconds:  # of a large image, of which it cannot leave out what is unseen
+            if capture.seconds > capture.plain_seconds:  # such as on many threads, of which a graph takes one on a CPU
                 milliseconds = [f"{1e3 * seconds:.1f} ms" for seconds in (capture.seconds, capture.plain_seconds)]
                 self._failures = _MAX_FAILURES
                 self._failure = f"its graph takes {milliseconds[0]}, a plain call {milliseconds[1]}"
                 return None, self._failure
             self._capture = capture
-        return self._capture.replay, ""
+        results = self._capture.replay(tensors)
+        if results is None:
+            self._capture = None
+            return None, "the image shows more than its graph has room for: the next call is captured anew"
+        return results, ""
 
 
 class Capture:
@@ -140,8 +151,14 @@ class Capture:
         seconds, plain_seconds: How long it takes forward as a graph, and as a plain call.
     """
 
-    def __init__(self, function: TensorFunction, tensors: Sequence[torch.Tensor], requires_grad: Sequence[bool]):
-        self._device = function.device
+    def __init__(
+        self,
+        function: TensorFunction,
+        tensors: Sequence[torch.Tensor],
+        requires_grad: Sequence[bool],
+        capacities: Capacities,
+    ):
+        self._device, self._capacities = function.device, capacities
         self._inputs = [tensor.detach().clone(memory_format=torch.contiguous_format) for tensor in tensors]
         self._arguments = [as_array(*pair) for pair in zip(self._inputs, function.dtypes, strict=True)]
         self._state = 0  # counts replays; gradients are of the last
@@ -149,24 +166,24 @@ class Capture:
         warp_device = wp.device_from_torch(function.device)
         if warp_device.is_cuda and not wp.is_mempool_enabled(warp_device):
             raise RuntimeError(f"{warp_device} has no memory pool (wp.set_mempool_enabled)")
-        with current_stream(function.device), unrecorded():
+        with current_stream(function.device), unrecorded(), capacities.used():
             self.plain_seconds = self._seconds_of(lambda: function.function(*self._arguments))
         with collecting_constants() as self._cached_values:
-            with wp.ScopedCapture(device=warp_device) as capture:
+            with capture(warp_device) as captured, capacities.used():
                 self._tape, self._results = function.record(self._arguments, requires_grad)  # zeroes gradients, too
-            self._forward = capture.graph
+            self._forward = captured.graph
             if self._tape is not None:
                 self._adjoints = [torch.zeros_like(tensor_of(result)) for result in self._results]
                 sources = [
                     array_of(adjoint, result.dtype)
                     for adjoint, result in zip(self._adjoints, self._results, strict=True)
                 ]
-                with wp.ScopedCapture(device=warp_device) as capture, unrecorded():
+                with capture(warp_device) as captured, unrecorded():
                     for result, source in zip(self._results, sources, strict=True):
                         if result.requires_grad:
                             wp.copy(result.grad, source)
                     self._tape.backward()
-                self._backward = capture.graph
+                self._backward = captured.graph
         with current_stream(function.device):
             self.seconds = min(self._seconds_of(lambda: wp.capture_launch(self._forward)) for _ in range(2))
 
@@ -178,9 +195,11 @@ class Capture:
         wp.synchronize_device(wp.device_from_torch(self._device))
         return time.perf_counter() - start
 
-    def replay(self, tensors: Sequence[torch.Tensor]) -> CallResults:
-        """Replay it forward."""
+    def replay(self, tensors: Sequence[torch.Tensor]) -> CallResults | None:
+        """Replay it forward; None where its graph has no room for the results."""
         self._launch_forward(tensors)
+        if self._capacities.is_exceeded:
+            return None
         with current_stream(self._device):
             results = tuple(tensor_of(result).clone() for result in self._results)
         playback = functools.partial(self._gradients, [tensor.detach() for tensor in tensors], self._state)

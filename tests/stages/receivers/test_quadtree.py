@@ -11,8 +11,9 @@ from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.rasterization import rasterize
-from warpshadow.stages.receivers.find import find_receivers, number_receivers
+from warpshadow.stages.receivers.find import find_receivers
 from warpshadow.stages.receivers.quadtree import find_quadtree, probe_grid
+from warpshadow.stages.receivers.vertex_receivers import number_receivers
 
 # Interpolated float32 positions of size 1.
 FLOAT32 = 2e-6
@@ -37,6 +38,13 @@ def shares_of(fragments, supersampling, value):
     return np.tile(value(column / supersampling), (len(fragments.face_ids), len(row), 1))
 
 
+def squares_of(fragments, shares, supersampling, keys=None):
+    """The squares of the sheet, or of other keys of sides."""
+    keys = wp.array(np.append(KEYS, KEYS) if keys is None else keys, dtype=wp.int32, device=fragments.face_ids.device)
+    on_device = wp.array(np.float32(shares), dtype=wp.float32, device=keys.device)
+    return find_quadtree(fragments.face_ids, keys, on_device, supersampling)
+
+
 def receivers_in(positions, faces, fragments, quadtree, supersampling):
     wants = KEYS >= 0
     numbering = number_receivers(np.repeat([[False, True]], [4, 3], axis=1), device=faces.device)
@@ -55,7 +63,7 @@ def test_samples_get_what_lies_where_they_look_from_few_receivers(device, supers
     """
     positions, faces, fragments = sheet_and_triangle(device, ((0, 0, 3.0), (0.3, 0.1, 3.2)), size=22 * supersampling)
     shares = shares_of(fragments, supersampling, lambda x: np.zeros_like(x) if edge is None else 1.0 * (x > edge))
-    quadtree = find_quadtree(fragments.face_ids, np.append(KEYS, KEYS), shares, supersampling)
+    quadtree = squares_of(fragments, shares, supersampling)
     found = receivers_in(positions, faces, fragments, quadtree, supersampling)
     got = interpolate(found.fragments, found.faces, found.points).numpy()
     gaps = np.linalg.norm(got - interpolate(fragments, faces, positions).numpy(), axis=-1)
@@ -76,7 +84,7 @@ def test_squares_are_small_where_light_has_an_edge_and_large_where_it_rises_even
         ("weak", lambda x: 0.01 * (x > 21)),
     ):
         shares = shares_of(fragments, 1, value)
-        sizes[name] = find_quadtree(fragments.face_ids, np.append(KEYS, KEYS), shares, 1).sizes.numpy()[0]
+        sizes[name] = squares_of(fragments, shares, 1).sizes.numpy()[0]
     far_left = np.s_[:, :8]  # the triangle is in the upper right quarter
     assert all((size[far_left] == 4).all() for size in sizes.values())
     below = np.s_[24:, 16:28]
@@ -95,7 +103,7 @@ def test_each_pixel_of_a_small_image_is_a_probe(size, spacing, device):
     for stripe in range(20, 24):
         shares = shares_of(fragments, 1, functools.partial(np.equal, stripe))
         assert shares.shape[2] == size // spacing + 1
-        sizes = find_quadtree(fragments.face_ids, np.append(KEYS, KEYS), shares, 1).sizes.numpy()[0]
+        sizes = squares_of(fragments, shares, 1).sizes.numpy()[0]
         missed += (sizes[-8:, stripe] > 0).all()
     assert missed == (0 if spacing == 1 else 2)
 
@@ -104,10 +112,10 @@ def test_bodies_and_sides_do_not_share_squares(device):
     positions, faces, fragments = sheet_and_triangle(device, size=32)
     shares = shares_of(fragments, 1, np.zeros_like)
     apart = np.array([0, 1, -1, 2, 3, -1])
-    quadtree = find_quadtree(fragments.face_ids, apart, shares, 1)
-    sides = fragments.face_ids.numpy().ravel()[quadtree.corners]
+    quadtree = squares_of(fragments, shares, 1, apart)
+    sides = fragments.face_ids.numpy().ravel()[quadtree.corners.numpy()]
     assert (sides == sides[:, :1]).all() and set(sides[:, 0]) == {0, 1}
-    assert len(quadtree.corners) > len(find_quadtree(fragments.face_ids, np.append(KEYS, KEYS), shares, 1).corners)
+    assert len(quadtree.corners) > len(squares_of(fragments, shares, 1).corners)
 
 
 def test_gradients_to_corners_are_central_differences(device, verified_tape):
@@ -117,7 +125,7 @@ def test_gradients_to_corners_are_central_differences(device, verified_tape):
     camera = ws.Camera.look_at(eye, (0.05, 0, 0), size=(22, 22))
     matrix = wp.array([camera.clip_matrix()], dtype=wp.mat44, device=device)
     shares = shares_of(fragments, 2, lambda x: 0.05 * np.abs(x - 6))
-    quadtree = find_quadtree(fragments.face_ids, np.append(KEYS, KEYS), shares, 2)
+    quadtree = squares_of(fragments, shares, 2)
     assert {2, 4} <= set(quadtree.sizes.numpy()[0, -3].tolist())
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(1, 7, 3)) * [[[1, 1, 1]] * 4 + [[0, 0, 0]] * 3]  # else other samples see the triangle

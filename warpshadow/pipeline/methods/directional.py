@@ -242,7 +242,7 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
             projected_light = self.project_light(self.light.value())
         return find_sharpest_cells(projected_light, self._edge_radius)
 
-    def share_of_sharpest_light(self, group: Group) -> np.ndarray | None:
+    def share_of_sharpest_light(self, group: Group) -> wp.array | None:
         """Share of a group's unblocked light that still comes from the sharpest cells; None where nothing blocks."""
         sharpest = self._sharpest_cells
         cell_directions, scales = self.free_basis.blocking_directions, self._scales(sharpest.relative_radius)

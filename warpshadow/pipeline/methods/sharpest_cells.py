@@ -8,6 +8,7 @@ import warp as wp
 
 from warpshadow.assets.color import LUMINANCE
 from warpshadow.device.constants import constant
+from warpshadow.device.launch import launch
 from warpshadow.maths.directions import CHUNK, cell_radius
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.shading.projected_cells import ProjectedCells
@@ -60,7 +61,7 @@ def find_sharpest_cells(
 
 def find_share_of_sharpest_light(
     group: Group, sharpest: SharpestCells, cell_directions: np.ndarray, *, softness: float, merging: float
-) -> np.ndarray | None:
+) -> wp.array | None:
     """Share of a group's unblocked light that still comes from the sharpest cells.
 
     Args:
@@ -69,7 +70,7 @@ def find_share_of_sharpest_light(
         cell_directions: Directions of all cells, [direction, 3].
         softness, merging: Of spheres' shadows, in radii of the sharpest cells.
     Returns:
-        Shape [batch, receiver]; None where nothing blocks.
+        float32 of shape [batch, receiver]; None where nothing blocks.
     """
     directions, light, _, has_footprints, edge_radius, power = sharpest
     footprints, transmittance = group.footprints if has_footprints else None, None
@@ -81,11 +82,50 @@ def find_share_of_sharpest_light(
         transmittance = transmittance_past(transmittance, *coverages)
     if transmittance is None:
         return None
-    lit = shade_cells(transmittance, group.normals, directions, light, maximum=LARGEST_COEFFICIENT).numpy()[..., 0]
-    receiver_normals = group.normals.numpy()
-    plane_normals = receiver_normals[:, :1]  # points of a plane have this normal or its opposite
-    facing = plane_normals @ cell_directions.T  # [batch, 1, cell]
-    whole = [4 / len(power) * np.maximum(cosines, 0) @ power for cosines in (facing, -facing)]
-    is_front = (receiver_normals @ plane_normals.transpose(0, 2, 1))[..., 0] > 0
-    unblocked = np.where(is_front, *whole)
-    return np.divide(lit, unblocked, out=np.zeros_like(lit), where=unblocked > 0)
+    normals = group.normals
+    lit = shade_cells(transmittance, normals, directions, light, maximum=LARGEST_COEFFICIENT)
+    ratios = wp.empty(normals.shape, dtype=wp.float32, device=normals.device)
+    on_device = constant(cell_directions, wp.vec3d, normals.device), constant(power, wp.float64, normals.device)
+    unblocked = wp.empty((len(normals), 2), dtype=wp.float64, device=normals.device)
+    launch(_find_unblocked, unblocked.shape, inputs=[normals, *on_device], outputs=[unblocked])
+    launch(_divide, ratios.shape, inputs=[lit, normals, unblocked], outputs=[ratios])
+    return ratios
+
+
+@wp.kernel(enable_backward=False)
+def _find_unblocked(
+    # in
+    normals: wp.array2d(dtype=wp.vec3),
+    cell_directions: wp.array(dtype=wp.vec3d),
+    power: wp.array(dtype=wp.float64),
+    # out
+    unblocked: wp.array2d(dtype=wp.float64),
+):
+    """A thread owns a side of a plane: luminance on it if nothing blocks, 0 of the side of the first receiver."""
+    batch, side = wp.tid()
+    normal = wp.where(side == 0, 1.0, -1.0) * normals[batch, 0]
+    total = wp.float64(0.0)
+    for cell in range(power.shape[0]):
+        direction = cell_directions[cell]
+        cosine = wp.float64(normal[0]) * direction[0] + wp.float64(normal[1]) * direction[1]
+        cosine += wp.float64(normal[2]) * direction[2]
+        total += wp.max(cosine, wp.float64(0.0)) * power[cell]
+    unblocked[batch, side] = wp.float64(4.0) / wp.float64(power.shape[0]) * total
+
+
+@wp.kernel(enable_backward=False)
+def _divide(
+    # in
+    lit: wp.array2d(dtype=wp.vec3),
+    normals: wp.array2d(dtype=wp.vec3),
+    unblocked: wp.array2d(dtype=wp.float64),
+    # out
+    ratios: wp.array2d(dtype=float),
+):
+    """A thread owns a receiver: on a plane it has the normal of the first one or its opposite."""
+    batch, receiver = wp.tid()
+    side = wp.where(wp.dot(normals[batch, receiver], normals[batch, 0]) > 0.0, 0, 1)
+    ratio = wp.float64(0.0)
+    if unblocked[batch, side] > wp.float64(0.0):
+        ratio = wp.float64(lit[batch, receiver][0]) / unblocked[batch, side]
+    ratios[batch, receiver] = float(ratio)

@@ -3,11 +3,19 @@
 from collections.abc import Hashable
 
 import numpy as np
+import warp as wp
 
+from warpshadow.device.constants import note_use
 from warpshadow.pipeline.bodies.blockers import ONLY_SPHERES, BlockerKinds
 from warpshadow.pipeline.bodies.merged_scene import MergedScene
 from warpshadow.pipeline.receivers.static import StaticBodies
-from warpshadow.stages.receivers.find import Numbering, number_receivers
+from warpshadow.stages.receivers.vertex_receivers import (
+    Numbering,
+    VertexKeys,
+    number_receivers,
+    number_seen_vertices,
+    vertex_keys,
+)
 
 
 class SceneReceivers:
@@ -33,6 +41,7 @@ class SceneReceivers:
         # lamps; and rows are of light from infinitely far away, not from a shell
         self.caches_rows = is_far and not scene.bounces
         self._numberings: dict[Hashable, list[Numbering]] = {}
+        self._vertex_keys: dict[Hashable, list[VertexKeys]] = {}
         self._at_vertices: dict[tuple[int, ...], np.ndarray] = {}  # by the bodies out of which spheres bulge
 
     def at_samples(self, blocker_kinds: BlockerKinds = ONLY_SPHERES) -> np.ndarray:
@@ -57,6 +66,19 @@ class SceneReceivers:
             return bodies
         distinct = {*blocker_kinds.distinct_bodies, *np.flatnonzero(self._merged_scene.is_glossy).tolist()}
         return np.where(np.isin(bodies, list(distinct)), bodies, -1) if distinct else None
+
+    def number_seen(self, is_seen: wp.array, blocker_kinds: BlockerKinds) -> Numbering:
+        """Number the vertices that are seen, and may be receivers, where no body is static."""
+        key = frozenset(blocker_kinds.distinct_bodies), blocker_kinds.bulging_bodies
+        merged_scene, span_bodies = self._merged_scene, self.span_bodies(blocker_kinds)
+        if key not in self._vertex_keys:  # with backs and without, since a capture cannot make constants
+            bodies = None if span_bodies is None else span_bodies[merged_scene.body_of_vertex]
+            arguments = merged_scene.vertex_order, bodies, merged_scene.device
+            both_sides = self.at_vertices(blocker_kinds)
+            self._vertex_keys[key] = [vertex_keys(both_sides[:count], *arguments) for count in (1, 2)]
+        keys = self._vertex_keys[key][len(is_seen) - 1]
+        note_use(*keys)
+        return number_seen_vertices(is_seen, keys, are_distinct=span_bodies is not None)
 
     def number_all(
         self, blocker_kinds: BlockerKinds, has_backs: bool, static_bodies: StaticBodies | None = None

@@ -5,7 +5,6 @@ import functools
 from collections.abc import Mapping
 from typing import Generic, Protocol, TypeVar
 
-import numpy as np
 import warp as wp
 
 from warpshadow.assets.known_light import KnownLight
@@ -151,7 +150,7 @@ class VisibilitySteps(Method, Generic[Projected, FoundVisibility]):
         place = functools.partial(self.scene_blockers.place_blockers, blocker_kinds)
         return find_squares(place, self.share_of_sharpest_light, surfaces)
 
-    def share_of_sharpest_light(self, group: Group) -> np.ndarray | None:
+    def share_of_sharpest_light(self, group: Group) -> wp.array | None:
         """Share of a group's unblocked light that comes from the cells with the sharpest shadows.
 
         Returns:

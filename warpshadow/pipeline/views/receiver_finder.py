@@ -15,9 +15,10 @@ from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.image.outlines import find_outline_samples
 from warpshadow.stages.raster.rasterization import Fragments
-from warpshadow.stages.receivers.find import Numbering, Receivers, find_receivers, number_receivers, seen_vertices
+from warpshadow.stages.receivers.find import Receivers, find_receivers
 from warpshadow.stages.receivers.receiver_footprints import FootprintInputs
 from warpshadow.stages.receivers.sample_receivers import MAX_SHARED_SAMPLES
+from warpshadow.stages.receivers.vertex_receivers import Numbering, mark_seen_vertices, number_receivers
 from warpshadow.stages.silhouettes.find import Silhouettes
 
 _MIN_SHARED_SIZE = 128
@@ -77,18 +78,26 @@ class ReceiverFinder:
         pixel = wp.vec2(2.0 / size[1], 2.0 / size[0])
         footprint_inputs = FootprintInputs(without_gradient(clip_positions), widths, pixel)
         has_backs, at_samples = fragments.sides is not None, scene_receivers.at_samples(self._blocker_kinds)
-        if not is_readable(merged_scene.device):
-            numbering = scene_receivers.number_all(self._blocker_kinds, has_backs, self._static_bodies)
+        device, static_bodies, is_seen = merged_scene.device, self._static_bodies, None
+        if static_bodies is None or is_readable(device):
+            is_seen = mark_seen_vertices(fragments, silhouettes, positions.shape[1])
+        if static_bodies is None:
+            numbering = scene_receivers.number_seen(is_seen, self._blocker_kinds)
+        elif is_seen is None:
+            if device.is_cpu and (scene_receivers.is_adaptive & self._bodies_with_cached_rows()).any():
+                raise RuntimeError("receivers of bodies beside static ones are chosen on the host")
+            numbering = scene_receivers.number_all(self._blocker_kinds, has_backs, static_bodies)
         else:
             # cached rows are cheaper than receivers at samples
             has_cached_rows = scene_receivers.is_adaptive & self._bodies_with_cached_rows()
             at_samples = at_samples & ~has_cached_rows
-            numbering = self._number_seen(seen_vertices(fragments, silhouettes, positions.shape[1]), has_cached_rows)
-            if spheres is not None and (is_adaptive := scene_receivers.is_adaptive & at_samples).any():
-                surfaces = AdaptiveSurfaces(
-                    positions, normals, fragments, spheres, is_adaptive, self._supersampling, footprint_inputs
-                )
-                quadtree = method.find_squares(self._blocker_kinds, surfaces)
+            numbering = self._number_seen(is_seen.numpy(), has_cached_rows)
+        is_adaptive = scene_receivers.is_adaptive & at_samples
+        if device.is_cpu and spheres is not None and is_adaptive.any():
+            surfaces = AdaptiveSurfaces(
+                positions, normals, fragments, spheres, is_adaptive, self._supersampling, footprint_inputs
+            )
+            quadtree = method.find_squares(self._blocker_kinds, surfaces)
         if at_samples.any() and fragments.barycentrics.requires_grad:
             has_mean_slope = find_outline_samples(silhouettes, clip_positions, quadtree)
         shares_surfaces = (

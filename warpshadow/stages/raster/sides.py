@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import instance_in, rows
+from warpshadow.device.capacities import sizes_of
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, zeros
 from warpshadow.device.parallel import run_length
@@ -61,7 +62,7 @@ def _find_backs(
     run: int,
     # out
     shows_back: wp.array2d(dtype=wp.bool),
-    has_back: wp.array(dtype=wp.bool),
+    has_back: wp.array(dtype=wp.int32),
 ):
     """A thread owns a run of two-sided faces of a view: which of them the eye sees from behind; false before.
 
@@ -78,7 +79,7 @@ def _find_backs(
         c = wp.vec3d(positions[position_batch, corners[2]])
         if wp.dot(wp.cross(b - a, c - a), a - eye) > wp.float64(0.0):
             shows_back[view, face] = True
-            has_back[0] = True
+            has_back[0] = 1
 
 
 @wp.kernel(enable_backward=False)
@@ -89,16 +90,16 @@ def _find_sides(
     run: int,
     # out
     sides: wp.array2d(dtype=wp.int32),
-    has_back: wp.array(dtype=wp.bool),
+    has_back: wp.array(dtype=wp.int32),
 ):
-    """A thread owns a run of samples; ``has_back`` is false before."""
+    """A thread owns a run of samples; ``has_back`` is 0 before."""
     view, thread = wp.tid()
     for sample in range(thread * run, (thread + 1) * run):
         face = face_ids[view, sample]
         is_back = shows_back[view, wp.max(face, 0)] and face >= 0
         sides[view, sample] = join_side(face, is_back, shows_back.shape[1])
         if is_back:
-            has_back[0] = True
+            has_back[0] = 1
 
 
 def find_sides(
@@ -113,15 +114,15 @@ def find_sides(
         positions: Vertices [scene units], vec3 of shape [batch, vertex].
         clip_matrices: Cameras, mat44 of shape [batch]. Either of these batches may be 1 and then serves every instance.
     Returns:
-        Fragments with sides; the same as before if no sample sees a back. (That is read back, which waits for the
-        device. While a CUDA graph is captured nothing is, and there always are sides.)
+        Fragments with sides; the same as before if no sample sees a back, which is read back as a count of 0 or 1
+        (:mod:`warpshadow.device.capacities`).
 
     Not differentiable: which side is seen changes where a face is seen edge-on.
     """
     device = positions.device
     view_count, height, width = fragments.face_ids.shape
     shows_back = zeros((view_count, faces.shape[0]), wp.bool, device, outlives_recording=False)
-    has_back = zeros(2, wp.bool, device, outlives_recording=False)
+    has_back = zeros(2, wp.int32, device, outlives_recording=False)
     run = run_length(device, _FACE_RUN)
     launch(
         _find_backs,
@@ -129,7 +130,7 @@ def find_sides(
         inputs=[positions, faces, two_sided, clip_matrices, run],
         outputs=[shows_back, has_back[:1]],
     )
-    if not device.is_capturing and not has_back.numpy()[0]:
+    if not sizes_of("backs of faces", has_back[:1], 1)[0]:
         return fragments
     sides = empty(fragments.face_ids.shape, dtype=wp.int32, device=device)
     run = run_length(device, width)
@@ -139,6 +140,6 @@ def find_sides(
         inputs=[rows(fragments.face_ids), shows_back, run],
         outputs=[rows(sides), has_back[1:]],
     )
-    if not device.is_capturing and not has_back.numpy()[1]:
+    if not sizes_of("backs that are seen", has_back[1:], 1)[0]:
         return fragments
     return replace(fragments, sides=sides)

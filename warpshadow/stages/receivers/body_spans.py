@@ -12,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from warpshadow.device.capacities import write_numbers
 from warpshadow.device.constants import constant
 from warpshadow.device.lanes import block_count
-from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty
 from warpshadow.device.parallel import split_row
 from warpshadow.device.warp_internals import struct_of
 
@@ -143,32 +142,10 @@ def _no_numbers(device: str) -> wp.array:
     return wp.empty(0, dtype=wp.int32, device=device)
 
 
-_WRITTEN_AT_ONCE = 64  # numbers that a launch has as arguments
-_Numbers = wp.types.vector(length=_WRITTEN_AT_ONCE, dtype=wp.int32)
-
-
-@wp.kernel(enable_backward=False)
-def _write_numbers(
-    # in
-    numbers: _Numbers,
-    first: int,
-    # out
-    result: wp.array(dtype=wp.int32),
-):
-    """A thread owns a number."""
-    i = wp.tid()
-    result[first + i] = numbers[i]
-
-
 def _put(numbers: Sequence[int], device: wp.Device) -> wp.array:
     """Copy numbers to a device. While a graph is captured nothing may be: it gets them as arguments of launches."""
     if not numbers:
         return _no_numbers(device.alias)
     if not device.is_capturing:
         return constant(np.array(numbers, np.int32), wp.int32, device)
-    result = empty(len(numbers), dtype=wp.int32, device=device)
-    for first in range(0, len(numbers), _WRITTEN_AT_ONCE):
-        part = numbers[first : first + _WRITTEN_AT_ONCE]
-        arguments = [_Numbers(*part, *[0] * (_WRITTEN_AT_ONCE - len(part))), first]
-        launch(_write_numbers, len(part), inputs=arguments, outputs=[result])
-    return result
+    return write_numbers(np.array(numbers), device)

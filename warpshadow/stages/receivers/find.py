@@ -11,22 +11,21 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, instance_in
-from warpshadow.device.constants import cached_by_values, constant
+from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch, without_gradient
-from warpshadow.device.memory import empty, from_numpy, reshaped, zeros
-from warpshadow.device.parallel import run_dimensions, run_length, split_launch
+from warpshadow.device.memory import empty, reshaped
+from warpshadow.device.parallel import run_dimensions, split_launch
 from warpshadow.stages.raster.interpolation import interpolate_at
 from warpshadow.stages.raster.rasterization import Fragments
-from warpshadow.stages.raster.sides import split_side, split_sides
+from warpshadow.stages.raster.sides import split_side
 from warpshadow.stages.receivers.body_spans import Span, spans_of
 from warpshadow.stages.receivers.quadtree import Quadtree
 from warpshadow.stages.receivers.receiver_footprints import FootprintInputs, find_pixel_area
 from warpshadow.stages.receivers.receiver_means import VisibleSurface
 from warpshadow.stages.receivers.sample_receivers import find_sample_receivers
-from warpshadow.stages.silhouettes.find import Silhouettes
+from warpshadow.stages.receivers.vertex_receivers import Numbering
 
-_MARK_COST, _GATHER_COST = 5.0, 40.0
-"""Nanoseconds that a sample takes, to mark the corners of its face, and a receiver."""
+_GATHER_COST = 40.0  # nanoseconds that a receiver takes
 
 
 class Receivers(NamedTuple):
@@ -168,77 +167,26 @@ def _find_faces(
     receiver_faces[face] = result
 
 
-class Numbering(NamedTuple):
-    """Vertices that are receivers, and their indices."""
-
-    # [receiver − on static] int32, receivers not on static bodies; None for all vertices as they are
-    vertices: wp.array | None
-    static_vertices: np.ndarray  # [static vertex], the receivers on static bodies, which come first
-    receiver_of_vertex: wp.array  # [vertex, and their backs] int32, -1 for none
-    spans: tuple[Span, ...] = ()  # of receivers not on static bodies, by body; () where no body is distinct
-
-    @property
-    def moving_count(self) -> int:
-        """Number of receivers at vertices that are not on static bodies."""
-        return self.receiver_of_vertex.size if self.vertices is None else self.vertices.size
-
-    @property
-    def receiver_count(self) -> int:
-        """Number of receivers at vertices."""
-        return len(self.static_vertices) + self.moving_count
-
-
-def number_receivers(
-    keeps_vertex: np.ndarray,
-    is_static: np.ndarray | None = None,
-    sequence: np.ndarray | None = None,
-    bodies: np.ndarray | None = None,
-    *,
-    device: wp.DeviceLike,
-) -> Numbering:
-    """Choose the vertices that are receivers.
-
-    Args:
-        keeps_vertex: Which are, bool of shape [1, vertex], or [2, vertex] with their backs: see :func:`seen_vertices`.
-        is_static: Vertices of static bodies, bool of shape [vertex]; None if there are none.
-        sequence: All vertices in the sequence in which they become receivers, shape [vertex]: light is found fastest
-            where neighbors follow each other. None for the mesh's.
-        bodies: Body of each vertex, −1 where it is not distinct, shape [vertex]: receivers of a body
-            then follow each other. None where no body is distinct.
-        device: Where they are.
-    """
-    side_count, vertex_count = keeps_vertex.shape
-    if side_count == 1 and keeps_vertex.all() and is_static is None and sequence is None and bodies is None:
-        receiver_of_vertex = constant(np.arange(vertex_count), wp.int32, device)
-        return Numbering(None, np.empty(0, int), receiver_of_vertex)
-    sequence, bodies = _order_sides(vertex_count, side_count, sequence, bodies)
-    is_moving_receiver, static_vertices = keeps_vertex.ravel(), np.empty(0, int)
-    if is_static is not None:
-        is_moving_receiver, is_static_receiver = (keeps_vertex & ~is_static).ravel(), (keeps_vertex & is_static).ravel()
-        static_vertices = sequence[is_static_receiver[sequence]]
-    vertices = sequence[is_moving_receiver[sequence]]
-    receiver_of_vertex = np.full(keeps_vertex.size, -1, np.int32)
-    receiver_of_vertex[static_vertices] = np.arange(len(static_vertices))
-    receiver_of_vertex[vertices] = len(static_vertices) + np.arange(len(vertices))
-    return Numbering(
-        from_numpy(vertices, dtype=wp.int32, device=device),
-        static_vertices,
-        from_numpy(receiver_of_vertex, dtype=wp.int32, device=device),
-        () if bodies is None else spans_of(bodies[vertices]),
-    )
-
-
-@cached_by_values
-def _order_sides(
-    vertex_count: int, side_count: int, sequence: np.ndarray | None, bodies: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Order vertices, and then their backs, body by body: their sequence, and the body of each vertex and back."""
-    sequence = np.arange(vertex_count) if sequence is None else sequence
-    sequence = (sequence + vertex_count * np.arange(side_count)[:, None]).ravel()
-    if bodies is not None:
-        bodies = np.tile(bodies, side_count)
-        sequence = sequence[np.argsort(bodies[sequence], kind="stable")]
-    return sequence, bodies
+@wp.kernel(enable_backward=False)
+def _find_triangles(
+    # in
+    corners: wp.array2d(dtype=wp.int32),
+    receiver_numbers: wp.array(dtype=wp.int32),
+    receiver_count: int,
+    first_face: int,
+    # out
+    receiver_faces: wp.array(dtype=wp.vec3i),
+):
+    """A thread owns a square of corners a b / c d, −1 for none, and its triangles a b c and d c b."""
+    square = wp.tid()
+    receivers = wp.vec4i()
+    for k in range(4):
+        receivers[k] = receiver_count + receiver_numbers[wp.max(corners[square, k], 0)]
+    if corners[square, 0] < 0:
+        receivers = wp.vec4i()
+    face = first_face + 2 * square
+    receiver_faces[face] = wp.vec3i(receivers[0], receivers[1], receivers[2])
+    receiver_faces[face + 1] = wp.vec3i(receivers[3], receivers[2], receivers[1])
 
 
 def find_receivers(
@@ -268,7 +216,7 @@ def find_receivers(
             with their backs where fragments have sides.
         has_sample_receivers: Faces whose samples have receivers of their own, bool of shape [face].
         bodies: Body of each face, −1 where it is not distinct, shape [face]; None where no body is, as for
-            :func:`number_receivers`.
+            :func:`.vertex_receivers.number_receivers`.
         supersampling: Samples of a pixel across and down: samples of a pixel with the same face share a receiver.
         quadtree: Squares in which samples of faces that want them interpolate; None for none.
         smooth_pieces: Smooth piece of each face, int32 of shape [face], where samples that see different faces of one
@@ -278,8 +226,7 @@ def find_receivers(
         has_mean_slope, shares_receivers: As for :func:`.sample_receivers.find_sample_receivers`.
         footprint_inputs: By which those of samples have footprints; None where all are points.
     Returns:
-        Receivers; where no face wants samples, many views of one geometry share them. While a graph is captured every
-        sample has room for one.
+        Receivers; where no face wants samples, many views of one geometry share them.
     Differentiable: positions, normals, barycentrics of the fragments.
     """
     device = positions.device
@@ -287,9 +234,8 @@ def find_receivers(
     sides = fragments.face_ids if fragments.sides is None else fragments.sides
     receiver_fragments = fragments if fragments.sides is None else Fragments(sides, fragments.barycentrics)
     batch_count, sample_fragments, samples = len(positions), None, None
-    triangles = np.empty((0, 3), np.int32)
     side_count, receiver_count = receiver_of_vertex.size // positions.shape[1] * len(faces), numbering.receiver_count
-    count = side_count
+    count = face_count = side_count
     if has_sample_receivers.any():
         batch_count = common_batch({"positions": positions, "fragments": sides})
         body_keys = np.zeros(len(faces), int) if bodies is None else bodies
@@ -304,15 +250,18 @@ def find_receivers(
         spans += tuple(
             Span(body, moving_count + first, moving_count + end) for body, first, end in sample_receivers.spans
         )
-        count += sample_fragments.face_ids.shape[1]
-        samples, triangles = sample_receivers.samples, sample_receivers.triangles
+        samples = sample_receivers.samples
+        count += samples.shape[1]
+        face_count = count if quadtree is None else count + 2 * len(quadtree.corners)
     elif vertices is None:
         return Receivers(positions, normals, faces, receiver_of_vertex, receiver_fragments)
-    receiver_faces = empty(count + len(triangles), dtype=wp.vec3i, device=device)
+    receiver_faces = empty(face_count, dtype=wp.vec3i, device=device)
     inputs = [faces, receiver_of_vertex, positions.shape[1], side_count, receiver_count]
     launch(_find_faces, count, inputs=inputs, outputs=[receiver_faces])
-    if len(triangles):
-        wp.copy(receiver_faces[count:], from_numpy(receiver_count + triangles, dtype=wp.vec3i, device=device))
+    if quadtree is not None and sample_fragments is not None:
+        numbers = reshaped(sample_receivers.numbers, (-1,))
+        inputs = [quadtree.corners, numbers, receiver_count, count]
+        launch(_find_triangles, len(quadtree.corners), inputs=inputs, outputs=[receiver_faces])
     vertices = receiver_of_vertex if vertices is None else vertices
     if bodies is None or sample_fragments is None or not sample_fragments.face_ids.size:
         footprint_inputs = None
@@ -436,61 +385,3 @@ def points_of_fragments(
     count = common_batch({"positions": positions, "fragments": fragments.face_ids})
     no_vertices = constant(np.empty(0, int), wp.int32, positions.device)
     return _gather_receiver_points(count, positions, normals, faces, no_vertices, fragments, footprint_inputs)
-
-
-@wp.kernel(enable_backward=False)
-def _mark_visible_corners(
-    first_row: int,
-    worker: int,
-    # in
-    sides: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    run: int,
-    # out
-    is_visible: wp.array2d(dtype=wp.bool),
-):
-    """A thread owns a run of samples: it marks the corners of the sides that they see."""
-    thread = first_row + wp.tid()
-    last_side = int(-1)
-    for sample in range(thread * run, (thread + 1) * run):
-        side = sides[sample]
-        if side != last_side and side >= 0:
-            face, is_back = split_side(side, faces.shape[0])
-            corners = faces[face]
-            for k in range(3):
-                is_visible[wp.where(is_back, 1, 0), corners[k]] = True
-        last_side = side
-
-
-def seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_count: int) -> np.ndarray:
-    """Find the vertices that have a part in an image: corners of visible faces, and of edges at silhouettes.
-
-    Args:
-        fragments: The fragments, of any number of instances.
-        silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`, whose edges have colors of their
-            own.
-        vertex_count: Number of vertices.
-    Returns:
-        bool of shape [1, vertex], or [2, vertex] where fragments have sides: the union over all instances, so that all
-        have as many receivers.
-    """
-    sides, side_count = (fragments.face_ids, 1) if fragments.sides is None else (fragments.sides, 2)
-    device, face_count = sides.device, len(silhouettes.faces)
-    corners = zeros((side_count, vertex_count), wp.bool, device, outlives_recording=False)
-    run = run_length(device, sides.shape[2])
-    launch(
-        _mark_visible_corners,
-        sides.size // run,
-        cost=_MARK_COST * run,
-        inputs=[reshaped(sides, (-1,)), silhouettes.faces, run],
-        outputs=[corners],
-    )
-    is_visible, edges = corners.numpy(), silhouettes.edges.numpy()
-    is_edge = edges >= 0
-    side_of_edge = np.zeros(edges.shape, int)
-    if side_count == 2:
-        # an edge is seen from the side that one of the samples beside it sees, each of which has an entry for it
-        _, is_back = split_sides(sides.numpy().ravel()[silhouettes.samples.numpy()], face_count)
-        side_of_edge[:] = is_back[:, None, None]
-    is_visible[side_of_edge[is_edge], edges[is_edge]] = True
-    return is_visible

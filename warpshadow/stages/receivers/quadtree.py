@@ -19,8 +19,9 @@ import warp as wp
 
 from warpshadow.device.constants import constant
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty, from_numpy
+from warpshadow.device.memory import empty, reshaped, zeros
 from warpshadow.device.parallel import split_row
+from warpshadow.stages.receivers.numbering import number_items
 
 MAX_SIDE = 4  # pixels of the side of the largest squares
 _FINE_PIXELS = 2**14
@@ -39,14 +40,9 @@ class Quadtree(NamedTuple):
 
     sizes: wp.array  # [view, row, column] int32, side of the square that a pixel is in [pixels], 0 for none
     numbers: wp.array  # [view, row, column] int32, number of the square, at its first pixel
-    corners: np.ndarray  # [square, 4] a b c d of each: view · samples + sample
-    is_corner: np.ndarray  # [view, sample] bool
+    corners: wp.array  # [square, 4] int32, a b c d of each: view · samples + sample; −1 for none
+    is_corner: wp.array  # [view, sample] bool
     square_key_of_side: wp.array  # [side] int32, the same for sides that share squares; −1 for sides that are in none
-
-    @property
-    def triangles(self) -> np.ndarray:
-        """Corners of the triangles, [2 · square, 3]: a square's first is left of its diagonal b c, above it."""
-        return self.corners[:, [[0, 1, 2], [3, 2, 1]]].reshape(-1, 3)
 
 
 def probe_spacing(size: tuple[int, int], supersampling: int) -> int:
@@ -139,7 +135,7 @@ def _is_accepted_between_probes(
     if max_ratio - min_ratio > tolerance:
         for corner in range(4):
             curvature_error = wp.max(
-                curvature_error, _curvature_error(ratios, keys, row + corner / 2, column + corner % 2)
+                curvature_error, _curvature_error(ratios, keys, row + corner // 2, column + corner % 2)
             )
     return curvature_error <= tolerance
 
@@ -155,86 +151,123 @@ def _cut_squares(
     tolerance: float,
     # out
     sizes: wp.array3d(dtype=wp.int32),
-    is_first: wp.array3d(dtype=wp.bool),
+    first_keys: wp.array3d(dtype=wp.int32),
 ):
     """A thread owns a row of the largest squares: pixels get the side of their accepted square, 0 for none.
 
-    The first pixel of a square is its upper left.
+    The first pixel of a square, its upper left, has a key, 0, others have −1.
     """
-    side = 4 / spacing  # of the largest squares, in probes
-    view, i = split_row(first_row + wp.tid(), probe_keys.shape[1] / side)
+    side = 4 // spacing  # of the largest squares, in probes
+    view, i = split_row(first_row + wp.tid(), probe_keys.shape[1] // side)
     view_keys = probe_keys[view]
     ratios = probe_ratios[view]
-    for j in range(view_keys.shape[1] / side):
+    for j in range(view_keys.shape[1] // side):
         row = side * i
         column = side * j
         is_accepted = _is_one_side(view_keys, row, column, side)
         is_accepted = is_accepted and _probe_error(ratios, view_keys, row, column, side) <= tolerance
         for quarter in range(4):
             size = int(4)
-            top = row + quarter / 2 * (side / 2)
-            left = column + quarter % 2 * (side / 2)
+            top = row + quarter // 2 * (side // 2)
+            left = column + quarter % 2 * (side // 2)
             if not is_accepted:
                 size = 0
-                if _is_one_side(view_keys, top, left, side / 2):
+                if _is_one_side(view_keys, top, left, side // 2):
                     if spacing == 1 and _probe_error(ratios, view_keys, top, left, 2) <= tolerance:
                         size = 2
                     if spacing == 2 and _is_accepted_between_probes(ratios, view_keys, top, left, tolerance):
                         size = 2
             for pixel in range(4):
-                y = spacing * top + pixel / 2
+                y = spacing * top + pixel // 2
                 x = spacing * left + pixel % 2
                 if y < sizes.shape[1] and x < sizes.shape[2]:
                     sizes[view, y, x] = size
-                    is_first[view, y, x] = size > 0 and y % size == 0 and x % size == 0
+                    is_first = size > 0 and y % size == 0 and x % size == 0
+                    first_keys[view, y, x] = wp.where(is_first, 0, -1)
+
+
+@wp.kernel(enable_backward=False)
+def _find_corners(
+    # in
+    first_pixels: wp.array2d(dtype=wp.int32),
+    sizes: wp.array3d(dtype=wp.int32),
+    height: int,
+    width: int,
+    supersampling: int,
+    # out
+    corners: wp.array2d(dtype=wp.int32),
+    is_corner: wp.array2d(dtype=wp.bool),
+):
+    """A thread owns a square, −1 for none; ``is_corner`` is false before."""
+    square = wp.tid()
+    pixel = first_pixels[0, square]
+    view, in_view = split_row(wp.max(pixel, 0), sizes.shape[1] * sizes.shape[2])
+    row, column = split_row(in_view, sizes.shape[2])
+    size = sizes[view, row, column]
+    for k in range(4):
+        corners[square, k] = -1
+        if pixel >= 0:
+            sample = sample_at(row + k // 2 * size, column + k % 2 * size, supersampling, height, width)
+            corners[square, k] = view * height * width + sample
+            is_corner[view, sample] = True
 
 
 def find_quadtree(
-    sides: wp.array, keys: np.ndarray, probe_ratios: np.ndarray, supersampling: int, *, tolerance: float = TOLERANCE
+    sides: wp.array, keys: wp.array, probe_ratios: wp.array, supersampling: int, *, tolerance: float = TOLERANCE
 ) -> Quadtree:
     """Find the squares in which samples interpolate.
 
     Args:
         sides: Side that each sample sees, −1 for none, int32 of shape [view, height, width].
-        keys: A number for each side, equal for sides in one plane, −1 for sides without squares.
+        keys: A number for each side, equal for sides in one plane, −1 for sides without squares, int32 of shape [side].
         probe_ratios: Light at the samples of :func:`probe_grid`, over that where nothing blocks any, float32 of shape
             [view, row, column]; anything where they see no side that has squares.
         tolerance: Error of interpolation at which a square is cut, in the unit of the ratios.
     """
     device, (view_count, height, width) = sides.device, sides.shape
     shape = view_count, height // supersampling, width // supersampling
-    keys_there = constant(keys, wp.int32, device)
-    sizes, is_first = empty(shape, dtype=wp.int32, device=device), empty(shape, dtype=wp.bool, device=device)
-    probe_keys = keys_of(sides, keys, supersampling)
-    inputs = [
-        from_numpy(probe_keys, dtype=wp.int32, device=device),
-        from_numpy(probe_ratios, dtype=wp.float32, device=device),
-    ]
+    sizes, first_keys = (empty(shape, dtype=wp.int32, device=device) for _ in range(2))
+    probe_keys = keys_of_probes(sides, keys, supersampling)
     spacing = probe_spacing(sides.shape[1:], supersampling)
     side = MAX_SIDE // spacing
     launch(
         _cut_squares,
         view_count * (probe_keys.shape[1] // side),
         cost=_SQUARE_COST * (probe_keys.shape[2] // side),
-        inputs=[*inputs, spacing, tolerance],
-        outputs=[sizes, is_first],
+        inputs=[probe_keys, probe_ratios, spacing, tolerance],
+        outputs=[sizes, first_keys],
     )
-    first_pixels = np.flatnonzero(is_first.numpy())
-    numbers = np.zeros(shape, np.int32)
-    numbers.ravel()[first_pixels] = np.arange(len(first_pixels))
-    view_rows, column = np.divmod(first_pixels, shape[2])
-    view, row = np.divmod(view_rows, shape[1])
-    side = sizes.numpy().ravel()[first_pixels]
-    top, bottom = (np.minimum(end * supersampling, height - 1) for end in (row, row + side))
-    left, right = (np.minimum(end * supersampling, width - 1) for end in (column, column + side))
-    top, bottom = ((view * height + end) * width for end in (top, bottom))
-    corners = np.stack([top + left, top + right, bottom + left, bottom + right], axis=1)
-    is_corner = np.zeros((view_count, height * width), bool)
-    is_corner.ravel()[corners] = True
-    return Quadtree(sizes, from_numpy(numbers, dtype=wp.int32, device=device), corners, is_corner, keys_there)
+    numbers, first_pixels, _, _ = number_items("squares", reshaped(first_keys, (1, -1)), 1)
+    corners = empty((first_pixels.shape[1], 4), dtype=wp.int32, device=device)
+    is_corner = zeros((view_count, height * width), wp.bool, device, outlives_recording=False)
+    inputs = [first_pixels, sizes, height, width, supersampling]
+    launch(_find_corners, len(corners), inputs=inputs, outputs=[corners, is_corner])
+    return Quadtree(sizes, reshaped(numbers, shape), corners, is_corner, keys)
 
 
-def keys_of(sides: wp.array, keys: np.ndarray, supersampling: int) -> np.ndarray:
-    """The keys of the sides that probes see, −1 for none, int of shape [view, row, column]."""
+@wp.kernel(enable_backward=False)
+def _find_keys(
+    # in
+    sides: wp.array3d(dtype=wp.int32),
+    keys: wp.array(dtype=wp.int32),
+    rows: wp.array(dtype=wp.int32),
+    columns: wp.array(dtype=wp.int32),
+    # out
+    probe_keys: wp.array3d(dtype=wp.int32),
+):
+    """A thread owns a probe."""
+    view, row, column = wp.tid()
+    side = sides[view, rows[row], columns[column]]
+    key = int(-1)
+    if side >= 0:
+        key = keys[side]
+    probe_keys[view, row, column] = key
+
+
+def keys_of_probes(sides: wp.array, keys: wp.array, supersampling: int) -> wp.array:
+    """The keys of the sides that probes see, −1 for none, int32 of shape [view, row, column]."""
     row, column = probe_grid(sides.shape[1:], supersampling)
-    return np.append(keys, np.int32(-1))[sides.numpy()[:, row[:, None], column]]  # side −1 has the last
+    probe_keys = empty((len(sides), len(row), len(column)), dtype=wp.int32, device=sides.device)
+    on_device = (constant(numbers, wp.int32, sides.device) for numbers in (row, column))
+    launch(_find_keys, probe_keys.shape, inputs=[sides, keys, *on_device], outputs=[probe_keys])
+    return probe_keys

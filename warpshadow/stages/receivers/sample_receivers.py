@@ -9,7 +9,6 @@
 - In squares of a quadtree there is one at each corner, and samples interpolate in triangles of these.
 """
 
-import functools
 import itertools
 from typing import NamedTuple
 
@@ -19,10 +18,11 @@ import warp as wp
 from warpshadow.device.batch import rows
 from warpshadow.device.constants import cached_by_values, constant
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty, filled, from_numpy, reshaped
+from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.body_spans import Span
+from warpshadow.stages.receivers.numbering import number_items
 from warpshadow.stages.receivers.quadtree import Quadtree, sample_at
 from warpshadow.stages.receivers.receiver_means import VisibleSurface, mean_fragments, sample_of_pixel
 
@@ -45,7 +45,7 @@ class SampleReceivers(NamedTuple):
     fragments: Fragments  # of the mesh's sides, then of a face for each receiver, then of triangles
     sample_fragments: Fragments  # sides and barycentrics that receivers see, [view, receiver]; −1 for none
     samples: wp.array  # [view, receiver] int32, the sample that owns each, −1 for none
-    triangles: np.ndarray  # [triangle, 3], the receivers in which others interpolate
+    numbers: wp.array  # [view, sample] int32, the receiver that each owns, −1 for none
     spans: tuple[Span, ...]
 
 
@@ -72,16 +72,17 @@ def _find_owner_samples(
     has_sample_receivers: wp.array(dtype=wp.bool),
     shares_receivers: wp.array(dtype=wp.bool),
     sizes: wp.array3d(dtype=wp.int32),
-    receiver_numbers: wp.array3d(dtype=wp.int32),
+    square_numbers: wp.array3d(dtype=wp.int32),
     is_corner: wp.array2d(dtype=wp.bool),
     keys: wp.array(dtype=wp.int32),
+    body_ranks: wp.array(dtype=wp.int32),
     width: int,
     supersampling: int,
     run: int,
     # out
     owner_samples: wp.array2d(dtype=wp.int32),
     weights: wp.array2d(dtype=wp.vec3),
-    is_owner: wp.array2d(dtype=wp.bool),
+    owner_ranks: wp.array2d(dtype=wp.int32),
 ):
     """A thread owns a run of pixels of a row: it finds where each sample has its light, and the weights there.
 
@@ -91,7 +92,8 @@ def _find_owner_samples(
     | −1 | interpolated between the vertices of the face |
     | −2 − t | interpolated in triangle t |
 
-    A corner of squares is at its sample, so others do not share it.
+    A corner of squares is at its sample, so others do not share it. Samples that own a receiver get the rank of their
+    body, others −1.
     """
     view, thread = split_row(first_row + wp.tid(), sides.shape[1] // (supersampling * supersampling) // run)
     pixels = width // supersampling
@@ -107,10 +109,10 @@ def _find_owner_samples(
         sample_step = wp.vec2()  # of a sample
         if sizes:
             size = sizes[view, row, column]
-            if size > 0:
-                top = row & -size
-                left = column & -size
-                square = -2 - 2 * receiver_numbers[view, top, left]
+            top = row & -size
+            left = column & -size
+            if size > 0 and square_numbers[view, top, left] >= 0:
+                square = -2 - 2 * square_numbers[view, top, left]
                 square_key = keys[sides[view, sample_at(top, left, supersampling, height, width)]]
                 square_width = wp.min((left + size) * supersampling, width - 1) - left * supersampling
                 square_height = wp.min((top + size) * supersampling, height - 1) - top * supersampling
@@ -159,50 +161,36 @@ def _find_owner_samples(
                 has_receiver = owner_sample == sample
                 if sizes:
                     has_receiver = has_receiver or is_corner[view, sample]
-                is_owner[view, sample] = has_receiver
+                rank = int(-1)
+                if has_receiver:
+                    rank = body_ranks[side % body_ranks.shape[0]]
+                owner_ranks[view, sample] = rank
 
 
 @wp.kernel(enable_backward=False)
-def _number_fragments(
+def _find_receiver_sides(
     first_row: int,
     worker: int,
     # in
     sides: wp.array2d(dtype=wp.int32),
     owner_samples: wp.array2d(dtype=wp.int32),
-    is_owner: wp.array2d(dtype=wp.bool),
     receiver_numbers: wp.array2d(dtype=wp.int32),
-    body_ranks: wp.array(dtype=wp.int32),
     side_count: int,
+    receiver_count: int,
     run: int,
     # out
     receiver_sides: wp.array2d(dtype=wp.int32),
-    samples: wp.array2d(dtype=wp.int32),
 ):
-    """A thread owns a run of samples.
-
-    ``receiver_numbers`` are the receivers' numbers; where they cannot be read (a capture), each body gets a range of
-    numbers, one for every sample.
-    """
+    """A thread owns a run of samples."""
     view, thread = split_row(first_row + wp.tid(), sides.shape[1] // run)
     for sample in range(thread * run, (thread + 1) * run):
         side = sides[view, sample]
         owner_sample = owner_samples[view, sample]
-        first_number = int(0)
-        if not receiver_numbers and side >= 0:
-            first_number = body_ranks[side % body_ranks.shape[0]] * sides.shape[1]
         if owner_sample >= 0:
-            number = first_number + owner_sample
-            if receiver_numbers:
-                number = receiver_numbers[view, owner_sample]
-            side = side_count + number
+            side = side_count + receiver_numbers[view, owner_sample]
         elif owner_sample < -1:
-            side = side_count + samples.shape[1] - 2 - owner_sample
+            side = side_count + receiver_count - 2 - owner_sample
         receiver_sides[view, sample] = side
-        if is_owner[view, sample]:
-            number = first_number + sample
-            if receiver_numbers:
-                number = receiver_numbers[view, sample]
-            samples[view, number] = sample
 
 
 def find_sample_receivers(
@@ -218,8 +206,8 @@ def find_sample_receivers(
 ) -> SampleReceivers:
     """Find the receivers of samples.
 
-    They come body by body. While a graph is captured their number is unknown, and each body has room for one at
-    every sample.
+    They come body by body, in tiles where there is a quadtree: light is found fastest where neighbors follow each
+    other.
 
     Args:
         fragments: Sides that samples see, and barycentrics.
@@ -240,10 +228,11 @@ def find_sample_receivers(
     sizes = squares = is_corner = keys = None
     if quadtree is not None:
         sizes, squares, keys = quadtree.sizes, quadtree.numbers, quadtree.square_key_of_side
-        is_corner = from_numpy(quadtree.is_corner, dtype=wp.bool, device=device)
+        is_corner = quadtree.is_corner
     owner_samples, receiver_sides = (empty(sides.shape, dtype=wp.int32, device=device) for _ in range(2))
     weights = empty(sides.shape, dtype=wp.vec3, device=device)
-    is_owner = empty(sides.shape, dtype=wp.bool, device=device)
+    owner_ranks = empty(sides.shape, dtype=wp.int32, device=device)
+    body_ids, body_ranks = _body_ranks(bodies, has_sample_receivers, device)
     run = run_length(device, width // supersampling)
     launch(
         _find_owner_samples,
@@ -259,36 +248,24 @@ def find_sample_receivers(
             squares,
             is_corner,
             keys,
+            body_ranks,
             width,
             supersampling,
             run,
         ],
-        outputs=[owner_samples, weights, is_owner],
+        outputs=[owner_samples, weights, owner_ranks],
     )
-    body_ids, body_ranks, ranks_on_device = _body_ranks(bodies, has_sample_receivers, device)
-    triangles = np.empty((0, 3), np.int32)
-    receiver_numbers, ends = None, sample_count * np.arange(len(body_ids) + 1)
-    if not device.is_capturing:
-        owner_indices = np.flatnonzero(is_owner.numpy())
-        if quadtree is not None:  # in tiles: light is found fastest where neighbors follow each other
-            tile_ranks = _ranks_in_tiles(shape[1], width, TILE * supersampling)
-            view, sample = np.divmod(owner_indices, sample_count)
-            owner_indices = owner_indices[np.argsort(view * sample_count + tile_ranks[sample])]
-        ranks = body_ranks[sides.numpy().ravel()[owner_indices] % len(bodies)]
-        owner_numbers, ends = _number_by_body(owner_indices // sample_count, ranks, view_count, len(body_ids))
-        number_of_samples = np.empty(sides.size, np.int32)
-        number_of_samples[owner_indices] = owner_numbers
-        receiver_numbers = from_numpy(number_of_samples.reshape(sides.shape), dtype=wp.int32, device=device)
-        if quadtree is not None:
-            triangles = number_of_samples[quadtree.triangles]
-    samples = filled((view_count, int(ends[-1])), -1, dtype=wp.int32, device=device)
+    order = None if quadtree is None else _order_by_tiles(shape[1], width, TILE * supersampling, device)
+    numbers, samples, ends, _ = number_items("receivers at samples", owner_ranks, len(body_ids), order)
+    if device.is_capturing and not samples.shape[1]:
+        raise RuntimeError("a graph is captured of an image without receivers at samples")
     run = run_length(device, width)
     launch(
-        _number_fragments,
+        _find_receiver_sides,
         view_count * (sample_count // run),
         cost=_SAMPLE_COST * run,
-        inputs=[sides, owner_samples, is_owner, receiver_numbers, ranks_on_device, side_count, run],
-        outputs=[receiver_sides, samples],
+        inputs=[sides, owner_samples, numbers, side_count, samples.shape[1], run],
+        outputs=[receiver_sides],
     )
     arguments = surface, fragments, owner_samples, is_corner, samples, supersampling, has_mean_slope
     sample_fragments = mean_fragments(*arguments)
@@ -296,7 +273,7 @@ def find_sample_receivers(
         Fragments(reshaped(receiver_sides, shape), reshaped(weights, shape)),
         sample_fragments,
         samples,
-        triangles,
+        numbers,
         tuple(
             Span(body_id, first, end)
             for body_id, (first, end) in zip(body_ids.tolist(), itertools.pairwise(ends.tolist()), strict=True)
@@ -336,51 +313,44 @@ def places_in_pixels(samples: wp.array, width: int, supersampling: int) -> wp.ar
 @cached_by_values
 def _body_ranks(
     bodies: np.ndarray, has_sample_receivers: np.ndarray, device: wp.DeviceLike
-) -> tuple[np.ndarray, np.ndarray, wp.array]:
-    """The bodies whose samples have receivers, and the rank among them of each face's body; that on the device, too."""
+) -> tuple[np.ndarray, wp.array]:
+    """The bodies whose samples have receivers, and the rank among them of each face's body, on the device."""
     body_ids = np.unique(bodies[has_sample_receivers])
-    body_ranks = np.searchsorted(body_ids, bodies)
-    return body_ids, body_ranks, constant(body_ranks, wp.int32, device)
+    return body_ids, constant(np.searchsorted(body_ids, bodies), wp.int32, device)
 
 
-@functools.lru_cache(maxsize=16)
-def _ranks_in_tiles(height: int, width: int, tile: int) -> np.ndarray:
-    """Rank of each sample of an image, tile by tile."""
+@cached_by_values
+def _order_by_tiles(height: int, width: int, tile: int, device: wp.DeviceLike) -> wp.array:
+    """Order the samples of an image tile by tile."""
     row, column = np.divmod(np.arange(height * width), width)
-    return np.argsort(np.lexsort((column // tile, row // tile)))
+    return constant(np.lexsort((column // tile, row // tile)), wp.int32, device)
 
 
-def _number_by_body(
-    views: np.ndarray, ranks: np.ndarray, view_count: int, body_count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Number receivers body by body, with as many numbers for a body as the view with the most of its receivers has.
-
-    Args:
-        views, ranks: View and body of each receiver.
-    Returns:
-        The number of each; and where the bodies begin, and the last ends.
-    """
-    view_and_body = views * body_count + ranks
-    counts = np.bincount(view_and_body, minlength=view_count * body_count)
-    ends = np.concatenate([[0], np.cumsum(counts.reshape(view_count, body_count).max(axis=0))])
-    positions_in_body = np.empty(len(view_and_body), int)
-    permutation = np.argsort(view_and_body.astype(np.min_scalar_type(len(counts))), kind="stable")  # small are quick
-    positions_in_body[permutation] = np.arange(len(view_and_body)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return positions_in_body + ends[ranks], ends
+@wp.kernel(enable_backward=False)
+def _select_fragments(
+    # in
+    sides: wp.array2d(dtype=wp.int32),
+    barycentrics: wp.array2d(dtype=wp.vec3),
+    samples: wp.array2d(dtype=wp.int32),
+    # out
+    selected_sides: wp.array2d(dtype=wp.int32),
+    selected_barycentrics: wp.array2d(dtype=wp.vec3),
+):
+    """A thread owns a selected sample."""
+    view, i = wp.tid()
+    sample = samples[view, i]
+    selected_sides[view, i] = wp.where(sample < 0, -1, sides[view, wp.max(sample, 0)])
+    selected_barycentrics[view, i] = barycentrics[view, wp.max(sample, 0)]
 
 
-def fragments_of_samples(fragments: Fragments, samples: np.ndarray) -> Fragments:
+def fragments_of_samples(fragments: Fragments, samples: wp.array) -> Fragments:
     """Select the fragments of some samples: sides and barycentrics [view, sample], without a gradient.
 
     Args:
-        samples: Which, int of shape [view, sample], −1 for none.
+        samples: Which, int32 of shape [view, sample], −1 for none.
     """
     sides = rows(fragments.face_ids if fragments.sides is None else fragments.sides)
-    items = samples + sides.shape[1] * np.arange(len(samples))[:, None]
-    fragment_sides = np.where(samples < 0, -1, sides.numpy().ravel()[items])
-    fragment_barycentrics = fragments.barycentrics.numpy().reshape(-1, 3).take(items, axis=0)
-    device = sides.device
-    return Fragments(
-        from_numpy(fragment_sides, dtype=wp.int32, device=device),
-        from_numpy(fragment_barycentrics, dtype=wp.vec3, device=device),
-    )
+    selected = Fragments(*(empty(samples.shape, dtype=dtype, device=sides.device) for dtype in (wp.int32, wp.vec3)))
+    inputs = [sides, rows(fragments.barycentrics), samples]
+    launch(_select_fragments, samples.shape, inputs=inputs, outputs=[selected.face_ids, selected.barycentrics])
+    return selected

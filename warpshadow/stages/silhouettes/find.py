@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from warpshadow import check
+from warpshadow.device.capacities import sizes_of
 from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, filled
 from warpshadow.device.parallel import run_length, split_row, strip_count
@@ -246,8 +247,7 @@ def _count_entries(
         has_entry = _has_crossing(crossings, sample, width)
         entries[sample] = wp.where(has_entry, count, -1)
         count += wp.where(has_entry, 1, 0)
-    if counts:
-        counts[thread] = count
+    counts[thread] = count
 
 
 @wp.kernel(enable_backward=False)
@@ -269,25 +269,23 @@ def _make_entries(
 ):
     """A thread owns ``run`` samples after one another, whose entries begin where the run before ends.
 
-    If that is not known, the number of the sample is the number of its entry.
+    Samples for which there is no room get none.
     """
     thread = first_row + wp.tid()
     first_entry = int(0)
-    if ends and thread > 0:
+    if thread > 0:
         first_entry = ends[thread - 1]
     for sample in range(thread * run, wp.min((thread + 1) * run, entries.shape[0])):
-        entry_number = entries[sample]
-        if entry_number >= 0 or not ends:
-            entry = wp.where(entry_number >= 0, first_entry + entry_number, -1)
-            if not ends:
-                entry = sample
-            samples[entry] = wp.where(entry_number >= 0, sample, -1)
+        entry = int(-1)
+        if entries[sample] >= 0 and first_entry + entries[sample] < samples.shape[0]:
+            entry = first_entry + entries[sample]
+            samples[entry] = sample
             for direction in range(4):
                 edge = wp.vec2i(NOTHING, NOTHING)
                 neighbor_edge = wp.vec2i(NOTHING, NOTHING)
                 is_before = direction % 2 == 0  # crossings are of the sample before
                 crossing_sample = wp.where(is_before, sample, neighbor(sample, direction, fragments.width))
-                if entry_number >= 0 and crossing_sample >= 0:
+                if crossing_sample >= 0:
                     axis = direction // 2
                     edge = edge_of_crossing(
                         fragments, neighbors, creases, crossings, crossing_sample, 2 * axis, not is_before
@@ -297,7 +295,7 @@ def _make_entries(
                     )
                 edges[entry, direction] = edge
                 line_areas[entry, direction] = measure_area(fragments, sample, direction, edge, neighbor_edge)
-            entries[sample] = wp.where(entry_number >= 0, entry, -1)
+        entries[sample] = entry
 
 
 def find_silhouettes(
@@ -319,8 +317,8 @@ def find_silhouettes(
         creases: Of each face the edges that are creases, 2ᵏ for that opposite to corner k, int32 of shape [face]; None
             where there are none.
     Returns:
-        Silhouettes. They have as many entries as need be: the count is read back, which waits for the device. While a
-        CUDA graph is captured they have one for each sample instead, and nothing is read.
+        Silhouettes. They have as many entries as need be: the count is read back, which waits for the device. In a
+        graph there is room for some more, −1 for no sample (:mod:`warpshadow.device.capacities`).
 
     Not differentiable: which lines lie between which samples changes at isolated poses only.
     """
@@ -347,17 +345,14 @@ def find_silhouettes(
         check.shape("bodies", bodies.shape, faces.shape)
         inputs = [arrays, neighbors, bodies, creases, run]
         launch(_find_intersections, thread_count, cost=_SAMPLE_COST * run, inputs=inputs, outputs=[crossings])
-    entries, ends = (
-        empty(sample_count, wp.int32, device),
-        None if device.is_capturing else empty(thread_count, wp.int32, device),
-    )
+    entries, ends = (empty(count, wp.int32, device) for count in (sample_count, thread_count))
     inputs = [crossings, arrays.width, run]
     launch(_count_entries, thread_count, cost=_ENTRY_COST * run, inputs=inputs, outputs=[entries, ends])
-    entry_count = sample_count
-    if ends is not None:
+    entry_count = 0
+    if thread_count:
         wp.utils.array_scan(ends, ends)
-        entry_count = int(ends[-1:].numpy()[0]) if thread_count else 0
-    samples = empty(entry_count, wp.int32, device)
+        entry_count = int(sizes_of("samples at silhouettes", ends[-1:], sample_count)[0])
+    samples = filled(entry_count, -1, wp.int32, device) if device.is_capturing else empty(entry_count, wp.int32, device)
     edges, line_areas = (empty((entry_count, 4), dtype, device) for dtype in (wp.vec2i, LineArea))
     inputs, outputs = [crossings, arrays, neighbors, creases, ends, run], [samples, edges, line_areas, entries]
     launch(_make_entries, thread_count, cost=_ENTRY_COST * run, inputs=inputs, outputs=outputs)
