@@ -19,7 +19,7 @@ SAME = {"rtol": 1e-5, "atol": 1e-6}
 @pytest.fixture(autouse=True)
 def any_time(monkeypatch):
     """Replay however long a graph takes."""
-    monkeypatch.setattr(Capture, "_seconds_of", lambda capture, run: (run(), 0.0)[1])
+    monkeypatch.setattr(Capture, "_timed", lambda capture, run: (run(), 0.0))
 
 
 @pytest.fixture
@@ -153,9 +153,27 @@ def test_calls_that_cannot_be_captured_stay_plain_and_say_why(make_renderer, mon
     assert "it cannot be captured: nothing is read" in renderer.replays.reason
 
 
+def test_calls_whose_graph_has_other_results_stay_plain(make_renderer, monkeypatch):
+    renderer, plain = make_renderer(), make_renderer(graphs=False)
+    draw, device = renderer.array_renderer.draw_inputs, renderer.array_renderer.device
+
+    def forgetful(*arguments, **options):
+        image = draw(*arguments, **options)
+        return wp.zeros_like(image) if device.is_capturing else image
+
+    monkeypatch.setattr(renderer.array_renderer, "draw_inputs", forgetful)
+    for shift in (0.1, 0.2, 0.3):
+        poses = moved(renderer, shift)
+        with torch.no_grad():
+            found, expected = (item(geometry=item.placed(*poses)) for item in (renderer, plain))
+        torch.testing.assert_close(found, expected, **SAME)
+    assert renderer.replays.reason.endswith("its graph has other results than the plain call")
+
+
 def test_calls_whose_graph_takes_longer_stay_plain(make_renderer, monkeypatch):
     renderer, seconds, runs = make_renderer(), [1e-3, 3e-3, 2e-3], []
-    monkeypatch.setattr(Capture, "_seconds_of", lambda capture, run: (runs.append(run()), seconds[len(runs) - 1])[1])
+    timed = lambda capture, run: (runs.append(run()), (runs[-1], seconds[len(runs) - 1]))[1]  # noqa: E731
+    monkeypatch.setattr(Capture, "_timed", timed)
     for shift in (0.1, 0.2, 0.3, 0.1, 0.2):
         image_and_gradients(renderer, shift)
     assert len(runs) == 3

@@ -17,7 +17,7 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable, Collection, Hashable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import warp as wp
@@ -38,7 +38,11 @@ from warpshadow.torch.autograd import (
 
 _PLAIN_CALLS = 2  # of a kind before it is captured: the first compiles kernels and fills caches, as may the second
 _MAX_FAILURES = 2  # after which calls of a kind stay plain
+_MAX_DIFFERENCE = 1e-4  # of results of a graph and a plain call, over the largest of these
 _MAX_HISTORIES = 8  # captured at a time: each holds the memory of its call
+
+
+_Result = TypeVar("_Result")
 
 
 class Replays:
@@ -164,10 +168,11 @@ class Capture:
         self._state = 0  # counts replays; gradients are of the last
         self._backward: wp.Graph | None = None
         warp_device = wp.device_from_torch(function.device)
+        no_gradients = self._arguments, [False] * len(self._arguments)
         if warp_device.is_cuda and not wp.is_mempool_enabled(warp_device):
             raise RuntimeError(f"{warp_device} has no memory pool (wp.set_mempool_enabled)")
-        with current_stream(function.device), unrecorded(), capacities.used():
-            self.plain_seconds = self._seconds_of(lambda: function.function(*self._arguments))
+        with current_stream(function.device), capacities.used():
+            plain_results, self.plain_seconds = self._timed(lambda: self._copies(function.record(*no_gradients)[1]))
         with collecting_constants() as self._cached_values:
             with capture(warp_device) as captured, capacities.used():
                 self._tape, self._results = function.record(self._arguments, requires_grad)  # zeroes gradients, too
@@ -185,15 +190,22 @@ class Capture:
                     self._tape.backward()
                 self._backward = captured.graph
         with current_stream(function.device):
-            self.seconds = min(self._seconds_of(lambda: wp.capture_launch(self._forward)) for _ in range(2))
+            self.seconds = min(self._timed(lambda: wp.capture_launch(self._forward))[1] for _ in range(2))
+            results = self._copies(self._results)
+        if not all(map(_agree, plain_results, results)):
+            raise RuntimeError("its graph has other results than the plain call")
 
-    def _seconds_of(self, run: Callable[[], object]) -> float:
-        """How long a call takes on the device."""
+    def _timed(self, run: Callable[[], _Result]) -> tuple[_Result, float]:
+        """The result of a call, and how long it takes on the device [s]."""
         wp.synchronize_device(wp.device_from_torch(self._device))
         start = time.perf_counter()
-        run()
+        result = run()
         wp.synchronize_device(wp.device_from_torch(self._device))
-        return time.perf_counter() - start
+        return result, time.perf_counter() - start
+
+    @staticmethod
+    def _copies(results: Sequence[wp.array]) -> tuple[torch.Tensor, ...]:
+        return tuple(tensor_of(result).clone() for result in results)
 
     def replay(self, tensors: Sequence[torch.Tensor]) -> CallResults | None:
         """Replay it forward; None where its graph has no room for the results."""
@@ -201,7 +213,7 @@ class Capture:
         if self._capacities.is_exceeded:
             return None
         with current_stream(self._device):
-            results = tuple(tensor_of(result).clone() for result in self._results)
+            results = self._copies(self._results)
         playback = functools.partial(self._gradients, [tensor.detach() for tensor in tensors], self._state)
         return CallResults(results, [result.requires_grad for result in self._results], playback)
 
@@ -226,3 +238,11 @@ class Capture:
             return tuple(
                 tensor_of(argument.grad).clone() if argument.requires_grad else None for argument in self._arguments
             )
+
+
+def _agree(result: torch.Tensor, other: torch.Tensor) -> bool:
+    """Whether the results of two calls are equal, but for rounding."""
+    if result.shape != other.shape:
+        return False
+    result, difference = result.double(), (result.double() - other.double()).abs()
+    return not result.numel() or bool(difference.max() <= _MAX_DIFFERENCE * result.abs().max())
