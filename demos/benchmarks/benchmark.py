@@ -4,6 +4,7 @@
     python demos/benchmarks/benchmark.py --busy     a loop in torch beside processes that compute
     python demos/benchmarks/benchmark.py --set-up   the first image of meshes of several kinds
     python demos/benchmarks/benchmark.py --host     what Python costs around the kernels
+    python demos/benchmarks/benchmark.py --graphs   calls of torch that are replayed as graphs, beside plain ones
 
 The scene has 10 327 vertices, 20 392 faces, 64 spheres for the bunny and an image of 256 × 256 with one sample a pixel.
 Visibility and shading are timed for all vertices; images, and iterations of fits, need those alone that are seen.
@@ -247,6 +248,48 @@ def time_host(device: str, runs: int) -> None:
     ws.set_thread_count(None)
 
 
+def time_graphs(device: str, runs: int) -> None:
+    """Milliseconds of plain calls and of replayed ones that take turns, on one thread; of a CPU, CPU time."""
+    ws.set_thread_count(1)
+    clock = time.process_time if wp.get_device(device).is_cpu else time.perf_counter
+    scene = bunny_scene()
+    camera = scene.camera
+    scenes = {
+        f"bunny, {size}²": dataclasses.replace(scene, camera=camera.resized(size / camera.width))
+        for size in (64, 128, 256)
+    }
+    print(f"  {'':50}{'plain':>10}{'graph':>10}")
+    for name, scene in {"42 vertices, 16²": small_scene(), **scenes}.items():
+        renderers = [TorchRenderer(scene, device=device, graphs=graphs) for graphs in (False, True)]
+        images, fits = zip(*map(moving_calls, renderers), strict=True)
+        for label, calls in (("image of bodies that have moved", images), ("iteration of a pose fit", fits)):
+            for _ in range(4):  # plain twice, then captured
+                calls[1]()
+            plain, graph = median_times(calls, runs, clock=clock)
+            reason = renderers[1].replays.reason
+            print(
+                f"  {f'{name}: {label}':50}{plain:10.1f}{graph:10.1f}  {reason and f'not replayed: {reason}'}",
+                flush=True,
+            )
+    ws.set_thread_count(None)
+
+
+def moving_calls(renderer: TorchRenderer) -> tuple[Callable[[], object], Callable[[], object]]:
+    """Functions that draw an image of bodies that have moved, and that run an iteration of a pose fit."""
+    rotations, translations, scales = renderer.scene_poses()
+    translations.requires_grad_()
+    shifts = itertools.cycle(1e-4 * step for step in range(7))
+
+    def draw() -> None:
+        with torch.no_grad():
+            renderer(geometry=renderer.placed(rotations, translations + next(shifts), scales))
+
+    def fit_pose() -> None:
+        renderer(geometry=renderer.placed(rotations, translations, scales)).square().sum().backward()
+
+    return draw, fit_pose
+
+
 def on_threads(count: int, function: Callable[[], object]) -> Callable[[], object]:
     """Make a function run on a number of threads."""
 
@@ -395,6 +438,7 @@ if __name__ == "__main__":
     parser.add_argument("--busy", action="store_true", help="time a loop in torch beside other processes")
     parser.add_argument("--set-up", action="store_true", help="time the first image of meshes, with nothing cached")
     parser.add_argument("--host", action="store_true", help="time the host alone: CPU time of a small scene")
+    parser.add_argument("--graphs", action="store_true", help="time replayed calls of torch beside plain ones")
     arguments = parser.parse_args()
     if arguments.busy:
         time_busy(arguments.runs)
@@ -402,11 +446,11 @@ if __name__ == "__main__":
     if arguments.set_up:
         time_set_up(arguments.device)
         sys.exit()
-    if arguments.host:
+    if arguments.host or arguments.graphs:
         ws.quiet()
         torch.set_num_threads(1)
         print(cpu_text())
-        time_host(arguments.device, arguments.runs)
+        (time_host if arguments.host else time_graphs)(arguments.device, arguments.runs)
         sys.exit()
     main(arguments.device, arguments.runs)
     time_host(arguments.device, arguments.runs)
