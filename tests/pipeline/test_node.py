@@ -131,6 +131,13 @@ def test_on_a_gpu_an_array_of_a_tensor_that_was_not_written_to_is_the_same(monke
     assert Input.renewed("spheres", (given,), first) is not first
 
 
+def test_on_a_gpu_an_array_is_not_the_same_as_one_that_a_function_makes(monkeypatch):
+    monkeypatch.setattr("warpshadow.pipeline.node.is_readable", lambda device: False)
+    of_scene, given = Input("cameras", array), array()
+    given.origin, given.version = object(), 7
+    assert Input.renewed("cameras", given, of_scene) is not of_scene
+
+
 def test_while_a_graph_is_captured_no_array_is_the_same(monkeypatch):
     """A graph has to hold the launches that its replays repeat on what is written to the array later."""
     given, tensor = array(), object()

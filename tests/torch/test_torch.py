@@ -277,6 +277,23 @@ def test_a_gradient_of_what_is_linear_can_be_differentiated_again(renderer):
     torch.testing.assert_close(shown[..., :3] + along[..., :3], renderer(values[0] + steps[0])[..., :3])
 
 
+def test_second_derivatives_of_colors_are_found_in_directions_that_are_no_colors():
+    """Directions have numbers below 0, and some far beyond 1, which no albedo has."""
+    lamp = ws.Body(ws.icosphere(0.3, 1), translation=(0, 2, 0), emission=(4.0, 3.0, 2.0), name="lamp")
+    ground = ws.Body(ws.plane(4.0, 4), (0.5, 0.5, 0.5), name="ground")
+    camera = ws.Camera.look_at((0, 2, 4), (0, 0.5, 0), size=(12, 12))
+    renderer = TorchRenderer(ws.Scene((lamp, ground), ws.synthetic_sky(), camera), progress=False)
+    for name, body, start in (("emission", "lamp", [4.0, 3.0, 2.0]), ("albedo", "ground", [0.5, 0.5, 0.5])):
+        value, direction = torch.tensor([start], requires_grad=True), torch.tensor([[0.1, -0.2, 0.05]])
+
+        def gradient(color, name=name, body=body):
+            return torch.autograd.grad(renderer(**{name: {body: color}}).square().sum(), color, create_graph=True)[0]
+
+        (found,) = torch.autograd.grad((gradient(value) * 100 * direction).sum(), value)
+        expected = 100 * (gradient(value + direction) - gradient(value))
+        torch.testing.assert_close(found, expected.detach(), rtol=1e-3, atol=1e-3 * float(expected.detach().abs().max()))
+
+
 def test_other_second_derivatives_are_refused_instead_of_being_0(renderer):
     with pytest.raises(NotImplementedError, match=r"^parameters: got asked for a second derivative"):
         torch.autograd.functional.hessian(lambda turns: rotation_matrices(turns).sum(), torch.ones(3))

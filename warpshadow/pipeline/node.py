@@ -91,18 +91,21 @@ def _is_same(new_value: Any, last: Input) -> bool:
     arrays, value = _arrays(new_value), last.value()
     if not arrays:
         return bool(new_value == value)
-    return all(map(_is_same_array, arrays, _arrays(last.original) or arrays, _arrays(value)))
+    originals = _arrays(last.original) or [None] * len(arrays)  # none of a value that a function makes
+    return all(map(_is_same_array, arrays, originals, _arrays(value)))
 
 
-def _is_same_array(array: wp.array, before: wp.array, copy: wp.array) -> bool:
+def _is_same_array(array: wp.array, before: wp.array | None, copy: wp.array) -> bool:
     """Whether an array equals a stored copy; on a GPU, whether it is the array before, not written to since."""
     if array.device.is_capturing:
         return False
     if is_readable(array.device):  # it sees writes by NumPy, which torch does not count
         return np.array_equal(np.asarray(array), np.asarray(copy))
     origin = getattr(array, "origin", None)
+    if before is None or origin is None:
+        return False
     marks = [(item.ptr, item.shape, item.strides, getattr(item, "version", None)) for item in (array, before)]
-    return origin is not None and origin is getattr(before, "origin", None) and marks[0] == marks[1]
+    return origin is getattr(before, "origin", None) and marks[0] == marks[1]
 
 
 class ExplainRow(NamedTuple):

@@ -214,8 +214,9 @@ class TensorFunction:
     def change_along(
         self, tensors: Sequence[torch.Tensor], directions: Sequence[torch.Tensor | None]
     ) -> list[torch.Tensor]:
-        """Change of the results as tensors move in directions: Σ f(…, direction, …) − f(…, 0, …), exact if affine.
+        """Change of the results as tensors move in directions d: Σ s (f(…, d⁺/s, …) − f(…, d⁻/s, …)), exact if affine.
 
+        With d = d⁺ − d⁻ and s = max |d| the function gets no number below 0 or above 1, such as no color is.
         Differentiable: tensors, directions.
         """
         total: list[torch.Tensor] = []
@@ -230,8 +231,11 @@ class TensorFunction:
                     f"{f'; of second order there are those of {affine_names}' if affine_names else ''}"
                 )
             before, after = tensors[:number], tensors[number + 1 :]
-            ends = (self(*before, end, *after) for end in (direction, torch.zeros_like(direction)))
-            change = [one - other for one, other in zip(*ends, strict=True)]
+            scale = direction.detach().abs().amax() if direction.numel() else direction.new_ones(())
+            scale = torch.where(scale > 0, scale, 1.0)
+            positive, negative = ((direction.abs() + sign * direction) / (2 * scale) for sign in (1, -1))
+            ends = (self(*before, end, *after) for end in (positive, negative))
+            change = [scale * (one - other) for one, other in zip(*ends, strict=True)]
             total = [one + other for one, other in zip(total, change, strict=True)] if total else change
         return total
 
