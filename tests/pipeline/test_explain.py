@@ -474,7 +474,8 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
         return next((name for part, name in after.items() if part in key), "silhouettes")
     if module.startswith("stages.textures"):
         if "_sample" in key:  # given the samples of white surfaces, it exposes them
-            return "radiance" if any(getattr(each, "dtype", None) is wp.vec4 for each in inputs) else "reflectance"
+            has_samples = any(getattr(each, "dtype", None) is wp.vec4 for each in inputs) and "coordinates" not in key
+            return "radiance" if has_samples else "reflectance"
         return "footprints" if "footprints" in key else "mip pyramids"
     if module == "stages.raster.interpolation":
         return "reflectance"
@@ -484,13 +485,12 @@ def stage_of(kernel: wp.Kernel, inputs: list) -> str | None:
         return "shading" if "_shade_cells" in key else "transfer"
     if module == "stages.image.film":
         return "averaging" if "average" in key else "radiance"
-    if module in ("stages.receivers.sample_receivers", "stages.receivers.receiver_means", "stages.receivers.quadtree"):
+    if module.startswith("stages.receivers.") or module == "device.capacities":
         return "receivers"
     return {
         "stages.geometry.normals": "normals",
         "stages.raster.project": "clip positions",
         "stages.raster.sides": "sides",
-        "stages.receivers.find": "receivers",
         "stages.light.shading": "shading",
         "stages.image.outlines": "radiance",
         "stages.image.slopes": "radiance",
