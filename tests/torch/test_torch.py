@@ -291,7 +291,8 @@ def test_second_derivatives_of_colors_are_found_in_directions_that_are_no_colors
 
         (found,) = torch.autograd.grad((gradient(value) * 100 * direction).sum(), value)
         expected = 100 * (gradient(value + direction) - gradient(value))
-        torch.testing.assert_close(found, expected.detach(), rtol=1e-3, atol=1e-3 * float(expected.detach().abs().max()))
+        expected = expected.detach()
+        torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
 
 
 def test_other_second_derivatives_are_refused_instead_of_being_0(renderer):
