@@ -75,77 +75,77 @@ class LightTransport:
     def __init__(self, method: Method):
         self.method = method
 
-    def shading(self, points: ShadingContext, light: LightInput, materials: Materials | None = None) -> Node:
+    def shading(self, context: ShadingContext, light: LightInput, materials: Materials | None = None) -> Node:
         """Light reflected by points as white surfaces, vec3 of shape [batch, receiver].
 
         Results for the scene's light and the last other known light are cached.
 
         Args:
-            points: The receivers.
+            context: The receivers.
             light: From :meth:`.Method.light_input`.
             materials: They matter where light bounces, and where bodies emit; None for the scene's.
         """
-        without_emitters = self.shading_without_emitters(points, light, materials)
-        return self._with_emitters(without_emitters, points, materials or points.materials)
+        without_emitters = self.shading_without_emitters(context, light, materials)
+        return self._with_emitters(without_emitters, context, materials or context.materials)
 
     def shading_without_emitters(
-        self, points: ShadingContext, light: LightInput, materials: Materials | None = None
+        self, context: ShadingContext, light: LightInput, materials: Materials | None = None
     ) -> Node:
         """Light that white points reflect, without direct light of emitters, but with their bounced light."""
         if not self.method.merged_scene.scene.bounces:
-            return self.method.direct_shading_node(points, light)
-        materials = materials or points.materials
-        bounce = functools.partial(self._bounced, points, light, materials)
-        if light.is_free or materials is not points.materials:
+            return self.method.direct_shading_node(context, light)
+        materials = materials or context.materials
+        bounce = functools.partial(self._bounced, context, light, materials)
+        if light.is_free or materials is not context.materials:
             return bounce()
-        return self.method.cached_for_light("shading", points, light, bounce)
+        return self.method.cached_for_light("shading", context, light, bounce)
 
-    def bounce_solver(self, points: ShadingContext, light: LightInput, materials: Materials) -> BounceSolver:
+    def bounce_solver(self, context: ShadingContext, light: LightInput, materials: Materials) -> BounceSolver:
         """How light bounces onto points."""
         varies = light.shell is not None and (light.shell.requires_grad or light.is_free and light.shell_count > 1)
         return choose_bounce_solver(
             is_free=light.is_free,
-            is_given=materials is not points.materials,
-            is_of_scene=points.is_scene_view and not varies,
+            is_given=materials is not context.materials,
+            is_of_scene=context.is_scene_view and not varies,
             has_spheres=self.method.visibility.traits.has_spheres,
             shares_directions=self.method.shares_directions,
         )
 
-    def notes(self, points: ShadingContext, light: LightInput, materials: Materials) -> list[str]:
+    def notes(self, context: ShadingContext, light: LightInput, materials: Materials) -> list[str]:
         """Say how often light bounces, and how, where it does."""
         count = self.method.merged_scene.scene.bounces
         if not count:
             return []
         times = "until none is left" if count == "all" else f"{count} time{'s' * (count != 1)}"
-        return [f"Light bounces {times}, {self.bounce_solver(points, light, materials).value}."]
+        return [f"Light bounces {times}, {self.bounce_solver(context, light, materials).value}."]
 
-    def _bounced(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
+    def _bounced(self, context: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Shading of points, direct and bounced."""
-        bounce_solver = self.bounce_solver(points, light, materials)
+        bounce_solver = self.bounce_solver(context, light, materials)
         if bounce_solver is BounceSolver.MOVING:
-            return self._moving_bounces.shading(points, light, materials)
-        direct = self.method.direct_shading_node(points, light)
+            return self._moving_bounces.shading(context, light, materials)
+        direct = self.method.direct_shading_node(context, light)
         if bounce_solver is BounceSolver.PATHS:
-            return self.method.path_shading_node(direct, points, light, materials)
+            return self.method.path_shading_node(direct, context, light, materials)
         static = self._static_bounces
         if not light.is_free:
-            return static.add_bounces(direct, self._lit_patch_samples(points, light, materials), points, materials)
+            return static.add_bounces(direct, self._lit_patch_samples(context, light, materials), context, materials)
         if light.shell_count > 1:
             raise ValueError(
                 f"shell: got {light.shell_count} for free light that bounces along rays, expected one, or the method "
                 "'directional'"
             )
-        samples = static.patch_samples(points, materials)
+        samples = static.patch_samples(context, materials)
         if materials.emission:
             emitted = self.method.cached_emitted_light_node(samples, materials)
-            direct = static.add_bounces(direct, emitted, points, materials)
+            direct = static.add_bounces(direct, emitted, context, materials)
         return static.add_free_bounces(
-            direct, self.method.cached_transfer_node(samples, light.shell), light, points, materials
+            direct, self.method.cached_transfer_node(samples, light.shell), light, context, materials
         )
 
-    def _lit_patch_samples(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
+    def _lit_patch_samples(self, context: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Direct shading of the samples of static patches in known light, vec3 of shape [batch, patch sample]."""
-        samples = self._static_bounces.patch_samples(points, materials)
+        samples = self._static_bounces.patch_samples(context, materials)
         return self._with_emitters(self.method.direct_shading_node(samples, light), samples, materials)
 
     def blocked_radiance(self, lobes: LitLobes, materials: Materials) -> Node | None:
@@ -158,7 +158,7 @@ class LightTransport:
         return self.method.lobes.blocked_radiance(lobes, lobes.points.select(bounced), selected_openness)
 
     def radiosity(
-        self, points: ShadingContext, light: LightInput, materials: Materials
+        self, context: ShadingContext, light: LightInput, materials: Materials
     ) -> tuple[Node, FaceTexels] | None:
         """Radiosity of surfaces, where patches of known light or of moving bodies have it.
 
@@ -170,34 +170,34 @@ class LightTransport:
         senders = self._patches.senders(materials) if self.method.merged_scene.scene.bounces else None
         if senders is None or not senders.bodies:
             return None
-        solver = self.bounce_solver(points, light, materials)
+        solver = self.bounce_solver(context, light, materials)
         if solver is BounceSolver.MOVING:
-            patch_radiosity = field_of(self._moving_bounces.radiosity(points, light, materials), "radiosity")
+            patch_radiosity = field_of(self._moving_bounces.radiosity(context, light, materials), "radiosity")
         elif not light.is_free:
-            at_patch_samples = self._lit_patch_samples(points, light, materials)
-            patch_radiosity = self._static_bounces.radiosity(at_patch_samples, points, materials)
+            at_patch_samples = self._lit_patch_samples(context, light, materials)
+            patch_radiosity = self._static_bounces.radiosity(at_patch_samples, context, materials)
         else:
             return None
         surface_radiosity = Node("", lambda radiosity: multiply(senders.mean_over_surfaces, radiosity), patch_radiosity)
         return surface_radiosity, senders.face_texels
 
-    def _openness(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node | None:
+    def _openness(self, context: ShadingContext, light: LightInput, materials: Materials) -> Node | None:
         """Part of the hemispheres of points that no blocker takes, vec3 of shape [view, receiver].
 
         It is found by the rays along which light bounces between static patches; None where light bounces in another
         way.
         """
-        if self.bounce_solver(points, light, materials) is not BounceSolver.STATIC:
+        if self.bounce_solver(context, light, materials) is not BounceSolver.STATIC:
             return None
-        at_patch_samples = None if light.is_free else self._lit_patch_samples(points, light, materials)
-        return self._static_bounces.openness(points, materials, at_patch_samples)
+        at_patch_samples = None if light.is_free else self._lit_patch_samples(context, light, materials)
+        return self._static_bounces.openness(context, materials, at_patch_samples)
 
-    def _with_emitters(self, light: Node, points: ShadingContext, materials: Materials) -> Node:
+    def _with_emitters(self, light: Node, context: ShadingContext, materials: Materials) -> Node:
         """Add direct light of emitters to other light on points; nothing where no body emits."""
         if not materials.emission:
             return light
-        emitted = self.method.cached_emitted_light_node(points, materials)
-        return points.cached("light with emitters", (light, emitted), lambda: Node("", add_light, light, emitted))
+        emitted = self.method.cached_emitted_light_node(context, materials)
+        return context.cached("light with emitters", (light, emitted), lambda: Node("", add_light, light, emitted))
 
     @functools.cached_property
     def _patches(self) -> ScenePatches:

@@ -113,7 +113,7 @@ def _add_emitted(portions: list[PortionForBounces], emitted: wp.array) -> list[P
 class PatchSampleNodes(NamedTuple):
     """Nodes of the points at which patches are lit."""
 
-    points: ShadingContext
+    context: ShadingContext
     visibility: TransferNode  # of the patch samples, a list of PortionForBounces
     frames: Node  # of flat bodies
     placed_proxies: Node  # proxies of the patches, in the world
@@ -223,79 +223,79 @@ class MovingBounces:
         )
         self._proxies: dict[Senders, Proxies] = {}
 
-    def shading(self, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
+    def shading(self, context: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Node of the shading of points, direct and bounced, vec3 of shape [batch, receiver].
 
         Their visibility is cached where it holds for other calls: in free light, and where colors vary.
 
         Args:
-            points: The receivers.
+            context: The receivers.
             light: The light.
             materials: Of the bodies.
         """
         method, senders = self._method, self._patches.senders(materials)
-        projected_light = method.projected_light_node(points, light)
+        projected_light = method.projected_light_node(context, light)
         if not senders.bodies:
-            direct = ShadingNode(method, points, projected_light, light)
+            direct = ShadingNode(method, context, projected_light, light)
             return Node("bounces", identity, direct, idle="every body is black")
-        make_visibility = self._visibility_maker(points, light)
-        key, is_cached = light.visibility_key, light.is_free or materials is not points.materials
-        visibility = points.cached("visibility", (key, is_cached), lambda: make_visibility(points, caches=is_cached))
-        radiosity = self.radiosity(points, light, materials)
-        item_text = functools.partial(receiver_text, points.weak_reference)
+        make_visibility = self._visibility_maker(context, light)
+        key, is_cached = light.visibility_key, light.is_free or materials is not context.materials
+        visibility = context.cached("visibility", (key, is_cached), lambda: make_visibility(context, caches=is_cached))
+        radiosity = self.radiosity(context, light, materials)
+        item_text = functools.partial(receiver_text, context.weak_reference)
         free_light = projected_light if light.is_free else None
         return BouncedShading(visibility, free_light, item_text, radiosity, self._gatherer(senders, item_text))
 
-    def radiosity(self, points: ShadingContext, light: LightInput, materials: Materials) -> Radiosity:
+    def radiosity(self, context: ShadingContext, light: LightInput, materials: Materials) -> Radiosity:
         """Node of the radiosity of the patches around points, if a body sends light."""
-        return points.cached("radiosity", (light, materials), lambda: self._make_radiosity(points, light, materials))
+        return context.cached("radiosity", (light, materials), lambda: self._make_radiosity(context, light, materials))
 
-    def _make_radiosity(self, points: ShadingContext, light: LightInput, materials: Materials) -> Radiosity:
+    def _make_radiosity(self, context: ShadingContext, light: LightInput, materials: Materials) -> Radiosity:
         method, senders = self._method, self._patches.senders(materials)
         proxies = self._proxies.setdefault(senders, Proxies(senders, method.visibility.merging))
-        patch_samples = points.cached(
+        patch_samples = context.cached(
             "of patch samples",
             (light.visibility_key, senders),
-            lambda: self._patch_samples(self._visibility_maker(points, light), proxies, points),
+            lambda: self._patch_samples(self._visibility_maker(context, light), proxies, context),
         )
         why_not = "light bounces once" if self._count == 1 else ""
         item_text = f"{len(senders.sides):,} patch samples"
         portions: Node = patch_samples.visibility
         if light.is_free:
-            free_light = method.projected_light_node(points, light)
+            free_light = method.projected_light_node(context, light)
             portions = DirectLightNode(patch_samples.visibility, free_light, item_text, OF_PATCH_SAMPLES)
         if materials.emission:
             portions = Node(
-                "", _add_emitted, portions, method.cached_emitted_light_node(patch_samples.points, materials)
+                "", _add_emitted, portions, method.cached_emitted_light_node(patch_samples.context, materials)
             )
         albedo = self._patches.albedo(materials, senders.bodies)
         gatherer = self._gatherer(senders, item_text, OF_PATCH_SAMPLES, why_not, only_others=True)
         return Radiosity(self._count, proxies, self._self_form_factors, gatherer, portions, albedo, patch_samples)
 
-    def _visibility_maker(self, points: ShadingContext, light: LightInput) -> Callable[..., TransferNode]:
+    def _visibility_maker(self, context: ShadingContext, light: LightInput) -> Callable[..., TransferNode]:
         """Makes nodes of visibility in free light, or of light if it is known."""
         return functools.partial(
             TransferNode if light.is_free else ShadingNode,
             self._method,
-            projected_light=self._method.visibility_basis_node(points, light),
+            projected_light=self._method.visibility_basis_node(context, light),
             light=light,
             result_of=functools.partial(_portion_for_bounces, self._method),
             join=identity,
         )
 
     def _patch_samples(
-        self, make_visibility: Callable[..., TransferNode], proxies: Proxies, points: ShadingContext
+        self, make_visibility: Callable[..., TransferNode], proxies: Proxies, context: ShadingContext
     ) -> PatchSampleNodes:
         """Nodes of the patch samples of the bodies around points."""
-        senders, planes, spheres = proxies.senders, proxies.senders.planes, points.spheres
+        senders, planes, spheres = proxies.senders, proxies.senders.planes, context.spheres
 
         def project(patch_samples: Receivers, visibility: list[PortionForBounces], *arguments: Any) -> PlacedProxies:
             return proxies.place(patch_samples, [portion.transmittance for portion in visibility], *arguments)
 
-        make_samples = functools.partial(lit_patch_samples, senders, points, proxies.nearest_spheres)
-        lit_samples = points.cached("patch samples beside proxies", proxies, make_samples)
+        make_samples = functools.partial(lit_patch_samples, senders, context, proxies.nearest_spheres)
+        lit_samples = context.cached("patch samples beside proxies", proxies, make_samples)
         visibility = make_visibility(lit_samples)
-        frames = Node("", planes.blockers.frames if planes else lambda _: None, points.vertices)
+        frames = Node("", planes.blockers.frames if planes else lambda _: None, context.vertices)
         placed_proxies = Node("", project, lit_samples.receivers_node, visibility, spheres, frames)
         weights = Node("", functools.partial(_patch_weights, senders), visibility)
         return PatchSampleNodes(lit_samples, visibility, frames, placed_proxies, weights)

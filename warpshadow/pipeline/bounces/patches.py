@@ -356,21 +356,21 @@ def _joined(parts: list[np.ndarray], dtype: type) -> np.ndarray:
 
 
 def lit_patch_samples(
-    senders: Senders, points: ShadingContext, nearest_spheres: np.ndarray | None = None
+    senders: Senders, context: ShadingContext, nearest_spheres: np.ndarray | None = None
 ) -> ShadingContext:
     """Make lit points of the patch samples of bodies around other points."""
     items, find = f"{len(senders.sides):,} patch samples", senders.patch_samples
-    receivers = Node("patch samples", find, points.vertices, points.normals, items=items)
+    receivers = Node("patch samples", find, context.vertices, context.normals, items=items)
     return ShadingContext(
-        points.merged_scene,
-        points.materials,
-        points.vertices,
-        points.spheres,
+        context.merged_scene,
+        context.materials,
+        context.vertices,
+        context.spheres,
         receivers,
-        points.call,
-        normals=points.normals,
-        blocker_kinds=points.blocker_kinds,
+        context.call,
+        normals=context.normals,
+        blocker_kinds=context.blocker_kinds,
         nearest_spheres=nearest_spheres,
-        shares_cache_with=points,
+        shares_cache_with=context,
         suffix=OF_PATCH_SAMPLES,
     )

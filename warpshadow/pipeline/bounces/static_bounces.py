@@ -45,28 +45,28 @@ class StaticBounces:
         self._bounces = method.merged_scene.scene.bounces  # 1 or more, or "all" until nothing is left
         self._is_still = method.shares_directions
 
-    def patch_samples(self, points: ShadingContext, materials: Materials) -> ShadingContext:
+    def patch_samples(self, context: ShadingContext, materials: Materials) -> ShadingContext:
         """The points of patches that are lit, of one instance."""
         senders = self._patches.senders(materials)
-        return points.cached("patch samples", senders, lambda: lit_patch_samples(senders, points))
+        return context.cached("patch samples", senders, lambda: lit_patch_samples(senders, context))
 
-    def add_bounces(self, direct: Node, at_patch_samples: Node, points: ShadingContext, materials: Materials) -> Node:
+    def add_bounces(self, direct: Node, at_patch_samples: Node, context: ShadingContext, materials: Materials) -> Node:
         """Add bounces to direct shading.
 
         Args:
             direct: Node of the direct shading of the receivers, vec3 of shape [batch, receiver].
             at_patch_samples: Node of that of :meth:`patch_samples`, vec3 of shape [batch, patch sample].
-            points: The receivers.
+            context: The receivers.
             materials: Of the bodies.
         """
         senders = self._patches.senders(materials)
         if not senders.bodies:
             return direct
-        factors = self._factors(points, materials, senders, at_patch_samples)
-        return self._shading(direct, _patch_light(at_patch_samples, factors, points), factors, points, materials)
+        factors = self._factors(context, materials, senders, at_patch_samples)
+        return self._shading(direct, _patch_light(at_patch_samples, factors, context), factors, context, materials)
 
     def add_free_bounces(
-        self, direct: Node, transfers: Node, light: Input, points: ShadingContext, materials: Materials
+        self, direct: Node, transfers: Node, light: Input, context: ShadingContext, materials: Materials
     ) -> Node:
         """Add bounces to the shading of free light; its transfer among the colors of the scene is cached.
 
@@ -74,7 +74,7 @@ class StaticBounces:
             direct: As above.
             transfers: Node of the transfer vectors of the patch samples, [1, patch sample, coefficient], in portions.
             light: The coefficients.
-            points: The receivers.
+            context: The receivers.
             materials: Of the bodies.
         """
         senders = self._patches.senders(materials)
@@ -88,13 +88,13 @@ class StaticBounces:
                 wp.array(np.repeat(white_light, 3, axis=2), dtype=wp.vec3, device=portions[0].device), factors
             )
 
-        factors = self._factors(points, materials, senders)
+        factors = self._factors(context, materials, senders)
         make_light = functools.partial(Node, "", light_on_patches, transfers, factors)
-        patch_light = points.cached("patches in each coefficient", transfers, make_light)
-        if materials is not points.materials:
+        patch_light = context.cached("patches in each coefficient", transfers, make_light)
+        if materials is not context.materials:
             make_transfer = functools.partial(Node, "", _as_transfer, patch_light)
-            transfer = points.cached("transfer of patches", patch_light, make_transfer)
-            return self._shading(direct, Node("", colored_light, transfer, light), factors, points, materials)
+            transfer = context.cached("transfer of patches", patch_light, make_transfer)
+            return self._shading(direct, Node("", colored_light, transfer, light), factors, context, materials)
 
         def bounced() -> Node:
             def find(albedo: wp.array, patch_light: wp.array, factors: StaticFormFactors) -> ColoredTransfer:
@@ -106,11 +106,11 @@ class StaticBounces:
         def shade(direct: wp.array, transfer: ColoredTransfer, light: wp.array, factors: StaticFormFactors) -> wp.array:
             return factors.to_receivers(direct, colored_light(transfer, light))
 
-        transfer = points.cached("bounces", patch_light, bounced)
-        return Node("bounces", shade, direct, transfer, light, factors, items=self._item_text(points, senders))
+        transfer = context.cached("bounces", patch_light, bounced)
+        return Node("bounces", shade, direct, transfer, light, factors, items=self._item_text(context, senders))
 
     def _shading(
-        self, direct: Node, patch_light: Node, factors: Node, points: ShadingContext, materials: Materials
+        self, direct: Node, patch_light: Node, factors: Node, context: ShadingContext, materials: Materials
     ) -> Node:
         """Shading with bounces, given the direct light on patches, vec3 of shape [batch, patch]."""
         senders = self._patches.senders(materials)
@@ -118,20 +118,20 @@ class StaticBounces:
         def bounce(direct: wp.array, radiosity: wp.array, factors: StaticFormFactors) -> wp.array:
             return factors.to_receivers(direct, multiply(factors.to_cache_points, radiosity))
 
-        radiosity = self._radiosity_node(patch_light, factors, points, materials)
-        return Node("bounces", bounce, direct, radiosity, factors, items=self._item_text(points, senders))
+        radiosity = self._radiosity_node(patch_light, factors, context, materials)
+        return Node("bounces", bounce, direct, radiosity, factors, items=self._item_text(context, senders))
 
-    def radiosity(self, at_patch_samples: Node, points: ShadingContext, materials: Materials) -> Node:
+    def radiosity(self, at_patch_samples: Node, context: ShadingContext, materials: Materials) -> Node:
         """Node of the radiosity of patches in the light of :meth:`add_bounces`, vec3 of shape [batch, patch]."""
-        factors = self._factors(points, materials, self._patches.senders(materials), at_patch_samples)
-        return self._radiosity_node(_patch_light(at_patch_samples, factors, points), factors, points, materials)
+        factors = self._factors(context, materials, self._patches.senders(materials), at_patch_samples)
+        return self._radiosity_node(_patch_light(at_patch_samples, factors, context), factors, context, materials)
 
-    def _radiosity_node(self, patch_light: Node, factors: Node, points: ShadingContext, materials: Materials) -> Node:
+    def _radiosity_node(self, patch_light: Node, factors: Node, context: ShadingContext, materials: Materials) -> Node:
         senders = self._patches.senders(materials)
         find = functools.partial(self._find_radiosity, senders=senders)
         albedo = self._patches.albedo(materials, senders.bodies)
         make = functools.partial(Node, "", find, albedo, patch_light, factors)
-        return points.cached("radiosity", (patch_light, materials), make)
+        return context.cached("radiosity", (patch_light, materials), make)
 
     def _light_at_cache_points(
         self, albedo: wp.array, patch_light: wp.array, factors: StaticFormFactors, senders: Senders
@@ -155,7 +155,7 @@ class StaticBounces:
 
         return after_bounces(self._bounces, light_of_others, reflect_all, senders.areas, self_bounces=SELF_BOUNCES)
 
-    def openness(self, points: ShadingContext, materials: Materials, at_patch_samples: Node | None) -> Node | None:
+    def openness(self, context: ShadingContext, materials: Materials, at_patch_samples: Node | None) -> Node | None:
         """Part of the hemispheres of points that no blocker takes, by the rays that find the light of blockers.
 
         So openness and bounced light have the same noise, which cancels in their ratio, the blockers' mean radiance.
@@ -170,43 +170,43 @@ class StaticBounces:
         senders = self._patches.senders(materials)
         if not senders.bodies:
             return None
-        return field_of(self._factors(points, materials, senders, at_patch_samples), "openness")
+        return field_of(self._factors(context, materials, senders, at_patch_samples), "openness")
 
-    def _item_text(self, points: ShadingContext, senders: Senders) -> Callable[[], str]:
-        weak_points = points.weak_reference
+    def _item_text(self, context: ShadingContext, senders: Senders) -> Callable[[], str]:
+        weak_points = context.weak_reference
         return lambda: f"{receiver_text(weak_points)}, {len(senders.areas):,} patches, {self._bounces} bounces"
 
     def _factors(
-        self, points: ShadingContext, materials: Materials, senders: Senders, at_patch_samples: Node | None = None
+        self, context: ShadingContext, materials: Materials, senders: Senders, at_patch_samples: Node | None = None
     ) -> Node:
         """Node of the form factors, the same in any light: light at patch samples tells where rays are sent."""
-        if not self._is_still or materials is not points.materials:  # form factors of a fit must not follow its light
+        if not self._is_still or materials is not context.materials:  # form factors of a fit must not follow its light
             at_patch_samples = None
 
         def make() -> Node:
-            patch_samples = self.patch_samples(points, materials)
+            patch_samples = self.patch_samples(context, materials)
             find = functools.partial(find_form_factors, senders, is_still=self._is_still, progress=self._progress)
             return Node(
                 "form factors",
                 find,
-                points.vertices,
+                context.vertices,
                 patch_samples.receivers_node,
-                points.receivers_node,
+                context.receivers_node,
                 self._openness(patch_samples),
-                self._openness(points),
+                self._openness(context),
                 at_patch_samples,
                 None if at_patch_samples is None else self._patches.albedo(materials, senders.bodies),
                 items=lambda: f"{len(senders.sides):,} patch samples × {len(senders.areas):,} patches",
                 has_adjoint=False,
             )
 
-        return points.cached("form factors", (senders, at_patch_samples), make)
+        return context.cached("form factors", (senders, at_patch_samples), make)
 
 
-def _patch_light(at_patch_samples: Node, factors: Node, points: ShadingContext) -> Node:
+def _patch_light(at_patch_samples: Node, factors: Node, context: ShadingContext) -> Node:
     """Node of the light on patches, vec3 of shape [batch, patch], cached for that at their samples."""
     make = functools.partial(Node, "", _light_on_patches, at_patch_samples, factors)
-    return points.cached("light of patches", at_patch_samples, make)
+    return context.cached("light of patches", at_patch_samples, make)
 
 
 def _light_on_patches(at_patch_samples: wp.array, factors: StaticFormFactors) -> wp.array:

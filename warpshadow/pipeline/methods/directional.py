@@ -253,11 +253,11 @@ class Directional(SphereMethod[ProjectedCells, CellVisibility]):
         """Visibility in lobes, between cells."""
         return CellLobes(self, self._directions)
 
-    def known_shading_node(self, points: ShadingContext, light: LightInput) -> Node:
+    def known_shading_node(self, context: ShadingContext, light: LightInput) -> Node:
         """Direct known light on points; where no light bounces, with the cells of bodies that shine."""
-        if self.merged_scene.scene.bounces or points.materials.roughness is None:
-            return super().known_shading_node(points, light)
-        return field_of(shading_with_cells_node(self, points, light), "shading")
+        if self.merged_scene.scene.bounces or context.materials.roughness is None:
+            return super().known_shading_node(context, light)
+        return field_of(shading_with_cells_node(self, context, light), "shading")
 
     def cached_rows(self, static_bodies: StaticBodies, light: Input | None, blocker_kinds: BlockerKinds) -> VertexRows:
         """Rows of the light of each cell that static bodies let through.

@@ -19,19 +19,19 @@ from warpshadow.pipeline.shading.visibility_nodes import LitPortion, ShadingNode
 CellMethod = SphereMethod[ProjectedCells, CellVisibility]
 
 
-def shading_with_cells_node(method: CellMethod, points: ShadingContext, light: LightInput) -> Node:
+def shading_with_cells_node(method: CellMethod, context: ShadingContext, light: LightInput) -> Node:
     """Node of the :class:`ShadingAndTransmittance` of points in known light that does not bounce."""
-    join, projected_light = functools.partial(_join_both, method), method.projected_light_node(points, light)
+    join, projected_light = functools.partial(_join_both, method), method.projected_light_node(context, light)
     make_shading = functools.partial(ShadingNode, result_of=_shading_and_cells, join=join)
-    make = functools.partial(make_shading, method, points, projected_light, light)
-    return method.cached_for_light("direct with cells", points, light, make)
+    make = functools.partial(make_shading, method, context, projected_light, light)
+    return method.cached_for_light("direct with cells", context, light, make)
 
 
-def cell_transmittance_node(method: CellMethod, points: ShadingContext, light: LightInput) -> Node:
+def cell_transmittance_node(method: CellMethod, context: ShadingContext, light: LightInput) -> Node:
     """Node of the transmittance of points towards cells, float32 of shape [batch, receiver, direction]."""
-    join, basis = functools.partial(_join, method), method.visibility_basis_node(points, light)
+    join, basis = functools.partial(_join, method), method.visibility_basis_node(context, light)
     make = functools.partial(VisibilityNode, suffix=" of gloss", result_of=_transmittance_of, join=join)
-    return points.cached("cells", light.visibility_key, lambda: make(method, points, basis, None))
+    return context.cached("cells", light.visibility_key, lambda: make(method, context, basis, None))
 
 
 class ShadingAndTransmittance(NamedTuple):

@@ -34,7 +34,7 @@ _RAYS_OF_PATH = 2
 def path_traced(
     direct: Node,
     meshes: Node,
-    points: ShadingContext,
+    context: ShadingContext,
     light: Input,
     shell: Input | wp.array | None,
     materials: Materials,
@@ -48,14 +48,14 @@ def path_traced(
     Args:
         direct: Node of the shading by direct light.
         meshes: Node of the meshes that block direct light, one for each instance.
-        points: The receivers.
+        context: The receivers.
         light: Known light.
         shell: Center and radius of the sphere that sends it, vec4 of shape [batch]; None for light infinitely far away.
         materials: Reflectance of the bodies.
         emitters: Node of the samples of emitters, where one emits within a cone alone; else None.
         samples: Rays of direct light for each receiver.
     """
-    merged_scene = points.merged_scene
+    merged_scene = context.merged_scene
     colors, emission_images = materials.textures_of["textures"], materials.textures_of.get("emission")
     maximum, paths = merged_scene.scene.bounces, -(-samples // _RAYS_OF_PATH)
     bounces = _MAX_PATH_BOUNCES if maximum == "all" else maximum
@@ -121,15 +121,15 @@ def path_traced(
             wp.copy(bounced[instance], light)
         return add_light(shading, bounced)
 
-    weak_points = points.weak_reference
+    weak_points = context.weak_reference
     return Node(
         "bounces",
         trace,
         direct,
-        points.receivers_node,
+        context.receivers_node,
         meshes,
-        points.vertices,
-        points.normals,
+        context.vertices,
+        context.normals,
         light,
         shell,
         _vertex_reflectance(materials),

@@ -45,47 +45,47 @@ class RayTraced(Method):
         super().__init__(merged_scene, HarmonicBasis(merged_scene.scene.visibility.order), basis, progress=progress)
         self.shares_directions = self.visibility.sampling == "shared"
 
-    def known_shading_node(self, points: ShadingContext, light: LightInput) -> Node:
+    def known_shading_node(self, context: ShadingContext, light: LightInput) -> Node:
         """Direct known light on points, towards which rays are drawn."""
         return Node(
-            f"shading{points.suffix}",
+            f"shading{context.suffix}",
             self._shade_shared if self.shares_directions else self._shade,
-            self.trees_around(points) if self.shares_directions else self._meshes(points),
-            points.receivers_node,
+            self.trees_around(context) if self.shares_directions else self._meshes(context),
+            context.receivers_node,
             light,
             self.shell_of(light),
-            items=functools.partial(receiver_text, points.weak_reference),
+            items=functools.partial(receiver_text, context.weak_reference),
             rows=(ExplainRow("transfer", idle="rays shade known light at once"),),
         )
 
-    def path_shading_node(self, direct: Node, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
+    def path_shading_node(self, direct: Node, context: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Shading of points in known light that bounces along paths, which have no gradient."""
         from warpshadow.pipeline.methods.paths import path_traced
 
-        emitters = self.emitters.samples_node(points) if self.merged_scene.has_beams else None
+        emitters = self.emitters.samples_node(context) if self.merged_scene.has_beams else None
         trace = functools.partial(path_traced, samples=self._sample_count, progress=self.progress)
-        return trace(direct, self._meshes(points), points, light, self.shell_of(light), materials, emitters)
+        return trace(direct, self._meshes(context), context, light, self.shell_of(light), materials, emitters)
 
-    def emitted_light_node(self, points: ShadingContext, materials: Materials) -> Node:
+    def emitted_light_node(self, context: ShadingContext, materials: Materials) -> Node:
         """Direct light of emitters on points, by rays to their samples. Differentiable: emission."""
-        name = f"light of emitters{points.suffix}"
-        return Node(name, self.emitters.traced_light, *self._rays_to_emitters(points, materials))
+        name = f"light of emitters{context.suffix}"
+        return Node(name, self.emitters.traced_light, *self._rays_to_emitters(context, materials))
 
-    def highlights_node(self, points: ShadingContext, materials: Materials, roughness: Node, cameras: Input) -> Node:
+    def highlights_node(self, context: ShadingContext, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, by rays to their samples."""
-        rays = self._rays_to_emitters(points, materials)
+        rays = self._rays_to_emitters(context, materials)
         return Node("highlights", self.emitters.traced_highlights, *rays, roughness, cameras)
 
-    def _rays_to_emitters(self, points: ShadingContext, materials: Materials) -> tuple[Node, Node, Node, Node]:
+    def _rays_to_emitters(self, context: ShadingContext, materials: Materials) -> tuple[Node, Node, Node, Node]:
         """Receivers, samples, their radiance, and the transmittance between."""
-        receivers, samples = points.receivers_node, self.emitters.samples_node(points)
+        receivers, samples = context.receivers_node, self.emitters.samples_node(context)
 
         def traced() -> Node:
-            name, items = f"rays to emitters{points.suffix}", functools.partial(receiver_text, points.weak_reference)
+            name, items = f"rays to emitters{context.suffix}", functools.partial(receiver_text, context.weak_reference)
             trace = self._trace_emitters
-            return Node(name, trace, points.vertices, receivers, samples, items=items, has_adjoint=False)
+            return Node(name, trace, context.vertices, receivers, samples, items=items, has_adjoint=False)
 
-        transmittance = points.cached("rays to emitters", None, traced)
+        transmittance = context.cached("rays to emitters", None, traced)
         return receivers, samples, self.emitters.radiance(materials), transmittance
 
     def _trace_emitters(
@@ -110,14 +110,14 @@ class RayTraced(Method):
         """Visibility in lobes, by rays."""
         return TracedLobes(self)
 
-    def transfer_node(self, points: ShadingContext, shell: Input | None) -> Node:
+    def transfer_node(self, context: ShadingContext, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
-        weak_points = points.weak_reference
+        weak_points = context.weak_reference
         node = Node(
-            f"transfer{points.suffix}",
+            f"transfer{context.suffix}",
             self._transfer,
-            self._meshes(points),
-            points.receivers_node,
+            self._meshes(context),
+            context.receivers_node,
             self.shell if shell is None else shell,
             items=lambda: f"{receiver_text(weak_points)} × {self.basis.size} coefficients",
         )
@@ -125,11 +125,11 @@ class RayTraced(Method):
             node.function = _refuse
         return node
 
-    def trees_around(self, points: ShadingContext) -> Node:
+    def trees_around(self, context: ShadingContext) -> Node:
         """Node of the trees of all vertices around points."""
-        name, vertices = "visibility" if self.shares_directions else "", points.vertices
+        name, vertices = "visibility" if self.shares_directions else "", context.vertices
         items = f"{len(self.merged_scene.body_of_face):,} faces"
-        return points.cached_with_neighbors("trees", None, lambda: Node(name, self._trees, vertices, items=items))
+        return context.cached_with_neighbors("trees", None, lambda: Node(name, self._trees, vertices, items=items))
 
     def _trees(self, positions: wp.array) -> list[FaceTree]:
         """Hierarchies of the blockers, for packets of rays."""
@@ -137,23 +137,23 @@ class RayTraced(Method):
         faces = merged_scene.faces.numpy()[np.isin(merged_scene.body_of_face, merged_scene.shadow_casters)]
         return [build_face_tree(item, faces, merged_scene.device) for item in positions.numpy()]
 
-    def _meshes(self, points: ShadingContext) -> Node:
+    def _meshes(self, context: ShadingContext) -> Node:
         """Node of the meshes that rays from points meet."""
 
         def meshes() -> Node:
-            weak_points = points.weak_reference
+            weak_points = context.weak_reference
             return Node(
-                f"visibility{points.suffix}",
+                f"visibility{context.suffix}",
                 self._blocker_meshes,
-                points.vertices,
-                detached(points.receivers_node),
+                context.vertices,
+                detached(context.receivers_node),
                 items=lambda: f"{receiver_text(weak_points)} by rays",
                 idle="" if self.merged_scene.shadow_casters else "no body has blockers",
                 caches=False,
                 rows=(ExplainRow("static shadows", idle="rays treat all receivers alike"),),
             )
 
-        return points.cached("meshes", None, meshes)
+        return context.cached("meshes", None, meshes)
 
     @property
     def _sample_count(self) -> int:

@@ -149,7 +149,7 @@ def _cached(values: dict[str, tuple[Hashable, Any]], name: str, key: Hashable, m
     return values[name][1]  # type: ignore[no-any-return]
 
 
-def receiver_text(points: ShadingContext, *, moving: bool = True, static: bool = True) -> str:
+def receiver_text(context: ShadingContext, *, moving: bool = True, static: bool = True) -> str:
     """Number of receivers, in words."""
-    count = points.counts()
+    count = context.counts()
     return f"{'up to ' * count.is_bound}{moving * count.moving + static * count.static:,} receivers"

@@ -180,9 +180,9 @@ class SceneEmitters:
             counts[is_varying] = np.maximum(np.rint(budget * power[is_varying]), 1)
         return np.split(counts, first[1:-1])
 
-    def samples_node(self, points: ShadingContext) -> Node:
+    def samples_node(self, context: ShadingContext) -> Node:
         """Node of the samples among the bodies around points."""
-        return points.cached_with_neighbors("emitters", None, lambda: Node("", self._place, points.vertices))
+        return context.cached_with_neighbors("emitters", None, lambda: Node("", self._place, context.vertices))
 
     def _place(self, vertices: wp.array) -> PlacedSamples:
         return place_samples(vertices, self.samples)

@@ -72,31 +72,31 @@ class LobeVisibility:
         count = max(self.sample_count, self.metal_sample_count if has_metal else 0)
         return max(count // self.receivers_across**2, min(count, _MIN_SAMPLES))
 
-    def _cached(self, name: str, points: ShadingContext, light: LightInput, make: Callable[[], Node]) -> Node:
+    def _cached(self, name: str, context: ShadingContext, light: LightInput, make: Callable[[], Node]) -> Node:
         """A node of known light, cached for the scene's light and, with points, for the last other one."""
         if light is not self._scene_light:
-            return points.cached(name, light, make)
+            return context.cached(name, light, make)
         if name not in self._of_scene:
             self._of_scene[name] = make()
         return self._of_scene[name]
 
-    def _separated(self, points: ShadingContext, light: LightInput) -> Node | None:
+    def _separated(self, context: ShadingContext, light: LightInput) -> Node | None:
         """Node of known light that is separated from its suns; None for light whose suns are not separated."""
         if light.is_free or self._merged_scene.scene.shell is not None:
             return None
-        return self._cached("separated light", points, light, lambda: Node("", _separate_suns, light))
+        return self._cached("separated light", context, light, lambda: Node("", _separate_suns, light))
 
-    def suns(self, points: ShadingContext, light: LightInput) -> Node | None:
+    def suns(self, context: ShadingContext, light: LightInput) -> Node | None:
         """Node of the suns of known light, which prefiltered light is without; None for other light."""
-        separated = self._separated(points, light)
+        separated = self._separated(context, light)
         return None if separated is None else field_of(separated, "suns")
 
-    def prefiltered(self, points: ShadingContext, light: LightInput, *, with_suns: bool = False) -> Node:
+    def prefiltered(self, context: ShadingContext, light: LightInput, *, with_suns: bool = False) -> Node:
         """Node of known light, by default without its suns, prefiltered, vec3 [1, texel]."""
-        separated = self._separated(points, light)
+        separated = self._separated(context, light)
         name = "prefiltered light with suns" if with_suns and separated is not None else "prefiltered light"
         arguments = self._prefilter, light, None if with_suns else separated
-        return self._cached(name, points, light, lambda: Node("prefiltering", *arguments))
+        return self._cached(name, context, light, lambda: Node("prefiltering", *arguments))
 
     def _prefilter(self, light: KnownLight, separated: SeparatedLight | None) -> wp.array:
         radiance = light.radiance if separated is None else separated.without_suns

@@ -105,32 +105,32 @@ class Method(abc.ABC):
 
         return MirroredBodies(self.merged_scene)
 
-    def cached_emitted_light_node(self, points: ShadingContext, materials: Materials) -> Node:
+    def cached_emitted_light_node(self, context: ShadingContext, materials: Materials) -> Node:
         """Direct light of emitters on points, vec3 of shape [batch, receiver], cached for the last emission."""
-        return points.cached("emitted", materials.emission, lambda: self.emitted_light_node(points, materials))
+        return context.cached("emitted", materials.emission, lambda: self.emitted_light_node(context, materials))
 
     @abc.abstractmethod
-    def emitted_light_node(self, points: ShadingContext, materials: Materials) -> Node:
+    def emitted_light_node(self, context: ShadingContext, materials: Materials) -> Node:
         """Direct light of emitters on points, past the blockers between, vec3 of shape [batch, receiver]."""
 
     @abc.abstractmethod
-    def highlights_node(self, points: ShadingContext, materials: Materials, roughness: Node, cameras: Input) -> Node:
+    def highlights_node(self, context: ShadingContext, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, past the blockers between: G and G', vec3 [batch, receiver].
 
         Args:
-            points: Receivers on bodies that shine.
+            context: Receivers on bodies that shine.
             materials: Of the bodies.
             roughness: Of the points, float32 of shape [batch, receiver].
             cameras: Clip matrices.
         """
 
     def light_input(
-        self, points: ShadingContext, light: LightArgument | None, shell: wp.array | None = None
+        self, context: ShadingContext, light: LightArgument | None, shell: wp.array | None = None
     ) -> LightInput:
         """The light of an image, or of other points, as an input, checked; the same for the same known light and shell.
 
         Args:
-            points: The receivers of the image.
+            context: The receivers of the image.
             light: None for the scene's.
             shell: Center and radius of the sphere that sends it [scene units], vec4 of shape [batch]; None for that of
                 the light itself.
@@ -140,15 +140,15 @@ class Method(abc.ABC):
         if is_of_scene and shell is None:
             return self.light
         if isinstance(light, wp.array):
-            return LightInput(light, self._shell_input(points, shell), why_new="light is given")
+            return LightInput(light, self._shell_input(context, shell), why_new="light is given")
         known = self.light.value() if light is None else as_light(light)
         if shell is None and known.shell is not None:  # it is not that of the scene
             shell = shell_array(known.shell, self.merged_scene.device)
-        shell_input = self._shell_input(points, shell)
-        why_new = "" if points.last_cached("light") is None else "light changed since the last call"
-        return points.cached("light", (known, shell_input), lambda: LightInput(known, shell_input, why_new=why_new))
+        shell_input = self._shell_input(context, shell)
+        why_new = "" if context.last_cached("light") is None else "light changed since the last call"
+        return context.cached("light", (known, shell_input), lambda: LightInput(known, shell_input, why_new=why_new))
 
-    def _shell_input(self, points: ShadingContext, shell: wp.array | None) -> Input | None:
+    def _shell_input(self, context: ShadingContext, shell: wp.array | None) -> Input | None:
         """The shell of light that is not the scene's, the same while its values are; None for the scene's."""
         if shell is None:
             return None
@@ -158,45 +158,45 @@ class Method(abc.ABC):
                 "scene's light has to have one: EnvironmentMap(…, radius=…)"
             )
         check_shell(shell)
-        renewed = Input.renewed("shell", shell, points.last_cached("shell"))
-        return points.cached("shell", renewed, lambda: renewed)
+        renewed = Input.renewed("shell", shell, context.last_cached("shell"))
+        return context.cached("shell", renewed, lambda: renewed)
 
     def shell_of(self, light: LightInput) -> Input | wp.array | None:
         """Center and radius of the sphere that sends light, vec4 of shape [batch]; None for light infinitely far."""
         return self.shell if light.shell is None else light.shell
 
-    def cached_transfer_node(self, points: ShadingContext, shell: Input | None = None) -> Node:
+    def cached_transfer_node(self, context: ShadingContext, shell: Input | None = None) -> Node:
         """Transfer vectors of points to :attr:`basis`, an array [batch, receiver, coefficient] for each portion.
 
         Args:
             shell: Of the light; None for that of the scene's.
         """
-        return points.cached("transfers", shell, lambda: self.transfer_node(points, shell))
+        return context.cached("transfers", shell, lambda: self.transfer_node(context, shell))
 
-    def cached_for_light(self, name: str, points: ShadingContext, light: LightInput, make: Callable[[], Node]) -> Node:
+    def cached_for_light(self, name: str, context: ShadingContext, light: LightInput, make: Callable[[], Node]) -> Node:
         """A node of points in known light, cached for the scene's light and for the last other one."""
         name = f"{name} of the scene" if light is self.light else name
-        return points.cached(name, light, make)
+        return context.cached(name, light, make)
 
-    def direct_shading_node(self, points: ShadingContext, light: LightInput) -> Node:
+    def direct_shading_node(self, context: ShadingContext, light: LightInput) -> Node:
         """Direct light that points reflect as white surfaces, without light of emitters, vec3 [batch, receiver].
 
         Known light is shaded at once; free light meets transfer vectors, which are cached.
         """
         if light.is_free:
-            return self._free_shading_node(points, light)
-        return self.cached_for_light("direct", points, light, lambda: self.known_shading_node(points, light))
+            return self._free_shading_node(context, light)
+        return self.cached_for_light("direct", context, light, lambda: self.known_shading_node(context, light))
 
     @abc.abstractmethod
-    def known_shading_node(self, points: ShadingContext, light: LightInput) -> Node:
+    def known_shading_node(self, context: ShadingContext, light: LightInput) -> Node:
         """Direct known light on points."""
 
-    def _free_shading_node(self, points: ShadingContext, light: LightInput) -> Node:
+    def _free_shading_node(self, context: ShadingContext, light: LightInput) -> Node:
         """Direct free light on points, which is converted where the transfer vectors are not."""
-        transfers = self.cached_transfer_node(points, light.shell)
+        transfers = self.cached_transfer_node(context, light.shell)
         matrix = self.native_from_basis if transfers.requires_grad else None
-        items = functools.partial(receiver_text, points.weak_reference)
-        name, shade = f"shading{points.suffix}", functools.partial(shade_free, matrix=matrix)
+        items = functools.partial(receiver_text, context.weak_reference)
+        name, shade = f"shading{context.suffix}", functools.partial(shade_free, matrix=matrix)
         return Node(name, shade, transfers, light, items=items)
 
     @functools.cached_property
@@ -208,7 +208,7 @@ class Method(abc.ABC):
         return conversion(basis, native)
 
     @abc.abstractmethod
-    def transfer_node(self, points: ShadingContext, shell: Input | None) -> Node:
+    def transfer_node(self, context: ShadingContext, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, an array for each portion, for light from a shell."""
 
     @functools.cached_property
@@ -218,10 +218,10 @@ class Method(abc.ABC):
 
         return LobeVisibility(self.merged_scene, self.light, shares_receivers=self.shares_lobes)
 
-    def path_shading_node(self, direct: Node, points: ShadingContext, light: LightInput, materials: Materials) -> Node:
+    def path_shading_node(self, direct: Node, context: ShadingContext, light: LightInput, materials: Materials) -> Node:
         """Shading of points in known light that bounces along paths, added to direct light."""
         raise NotImplementedError
 
-    def openness_node(self, points: ShadingContext) -> Node | None:
+    def openness_node(self, context: ShadingContext) -> Node | None:
         """Light that points reflect as white surfaces under an even sky of 1; None where rays find it on average."""
         return None

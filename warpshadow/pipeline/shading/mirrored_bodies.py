@@ -69,7 +69,7 @@ class MirroredBodies:
     def radiance(
         self,
         shown: ShownBodies,
-        points: ShadingContext,
+        context: ShadingContext,
         light: LightInput,
         materials: Materials,
         samples: Node,
@@ -82,7 +82,7 @@ class MirroredBodies:
 
         Args:
             shown: The bodies, of :meth:`shown`.
-            points: The receivers.
+            context: The receivers.
             light: Known or free.
             materials: Of the bodies.
             samples: Node of the samples of lobes, cached for a roughness.
@@ -99,11 +99,11 @@ class MirroredBodies:
 
         def trace() -> Node:
             find = functools.partial(self._find_hits, shown)
-            traced = points.vertices, points.normals, points.receivers_node, directions, transmittance
-            items = functools.partial(receiver_text, points.weak_reference)
+            traced = context.vertices, context.normals, context.receivers_node, directions, transmittance
+            items = functools.partial(receiver_text, context.weak_reference)
             return Node("hits of lobes", find, *(detached(source) for source in traced), items=items)
 
-        hits = points.cached("hits", (samples, light.visibility_key, shown), trace)
+        hits = context.cached("hits", (samples, light.visibility_key, shown), trace)
         roughness, albedo, metallic = (materials.of_vertices(name) for name in ("roughness", "albedo", "metallic"))
         mirrored = Node("", mirror, hits, faces, roughness, directions, blurs)
         directions, fresnel_weights, blurs = (

@@ -125,20 +125,20 @@ class SceneBlockers:
             parts[body] = len(self.scene_parts.parts[body])
         return {"spheres": spheres, "convex parts": parts}
 
-    def pairs_with(self, points: ShadingContext) -> str:
+    def pairs_with(self, context: ShadingContext) -> str:
         """Receivers and the blockers of all kinds but planes around them, in words."""
-        counts = self._counts(points.blocker_kinds)
+        counts = self._counts(context.blocker_kinds)
 
         def blockers(bodies: slice | list[int]) -> str:
             sums = {name: numbers[bodies].sum() for name, numbers in counts.items()}
             counted = [f"{count:,} {name}" for name, count in sums.items() if count or name == "spheres"]
             return f"up to {' and '.join(counted)}"  # some are culled, or merged
 
-        item_text = f"{receiver_text(points, static=False)} × {blockers(slice(None))}"
-        if points.static_bodies is None:
+        item_text = f"{receiver_text(context, static=False)} × {blockers(slice(None))}"
+        if context.static_bodies is None:
             return item_text
-        moving = list(points.static_bodies.moving)
-        return f"{item_text}, {receiver_text(points, moving=False)} on static bodies × {blockers(moving)}"
+        moving = list(context.static_bodies.moving)
+        return f"{item_text}, {receiver_text(context, moving=False)} on static bodies × {blockers(moving)}"
 
     def notes(self, kinds: BlockerKinds) -> list[str]:
         """Describe how each body blocks the light of others, and its own, and why; a line each."""

@@ -32,47 +32,49 @@ class SphereMethod(VisibilitySteps[Projected, FoundVisibility]):
     def _projected_scene_light(self) -> Node:
         return Node("", self.project_light, self.light, self.shell)
 
-    def projected_light_node(self, points: ShadingContext, light: LightInput) -> Node:
+    def projected_light_node(self, context: ShadingContext, light: LightInput) -> Node:
         """Node of light on points, projected for the method; the same for the same known light."""
         if light.is_free:
-            return Node("", self._with_free_light, light, self.visibility_basis_node(points, light))
+            return Node("", self._with_free_light, light, self.visibility_basis_node(context, light))
         if light is self.light:
             return self._projected_scene_light
         make = functools.partial(Node, "", self.project_light, light, self.shell_of(light))
-        return points.cached_with_neighbors("projected", light, make)
+        return context.cached_with_neighbors("projected", light, make)
 
-    def visibility_basis_node(self, points: ShadingContext, light: LightInput) -> Node | Projected:
+    def visibility_basis_node(self, context: ShadingContext, light: LightInput) -> Node | Projected:
         """The light by which visibility is found, projected: known light, or any free light of the same shell."""
-        return self.free_basis_node(points, light.shell) if light.is_free else self.projected_light_node(points, light)
+        return (
+            self.free_basis_node(context, light.shell) if light.is_free else self.projected_light_node(context, light)
+        )
 
-    def free_basis_node(self, points: ShadingContext, shell: Input | None) -> Node | Projected:
+    def free_basis_node(self, context: ShadingContext, shell: Input | None) -> Node | Projected:
         """The basis in which the method projects free light, or a node of it, the same for the same shell."""
         if shell is None:
             return self.free_basis
         make = functools.partial(Node, "", self.free_basis_of_shell, shell)
-        return points.cached_with_neighbors("free basis", shell, make)
+        return context.cached_with_neighbors("free basis", shell, make)
 
     def _with_free_light(self, light: wp.array, free_basis: Projected) -> Projected:
         """Project given free light for the method. Differentiable: light."""
         return free_basis.with_coefficients(change_basis(light, self.native_from_basis))
 
-    def emitted_light_node(self, points: ShadingContext, materials: Materials) -> Node:
+    def emitted_light_node(self, context: ShadingContext, materials: Materials) -> Node:
         """Direct light of emitters on points, by the same blockers."""
         from warpshadow.pipeline.shading.emitted_light import find_emitted_light
 
-        return self._emitter_node("light of emitters", find_emitted_light, points, materials)
+        return self._emitter_node("light of emitters", find_emitted_light, context, materials)
 
-    def highlights_node(self, points: ShadingContext, materials: Materials, roughness: Node, cameras: Input) -> Node:
+    def highlights_node(self, context: ShadingContext, materials: Materials, roughness: Node, cameras: Input) -> Node:
         """Direct light of emitters in the lobes of points, by the same blockers."""
         from warpshadow.pipeline.shading.emitted_light import find_highlights
 
-        return self._emitter_node("highlights", find_highlights, points, materials, roughness, cameras)
+        return self._emitter_node("highlights", find_highlights, context, materials, roughness, cameras)
 
     def _emitter_node(
-        self, name: str, find: Callable[..., Any], points: ShadingContext, materials: Materials, *others: Node | Input
+        self, name: str, find: Callable[..., Any], context: ShadingContext, materials: Materials, *others: Node | Input
     ) -> Node:
-        emitters, weak_points = self.emitters, points.weak_reference
-        portions_of = find_portions_of(points, by_body=True)
+        emitters, weak_points = self.emitters, context.weak_reference
+        portions_of = find_portions_of(context, by_body=True)
 
         def find_in_portions(
             receivers: Receivers, blockers: Blockers, self_lookups: Mapping[int, SelfLookup] | None, *arrays: Any
@@ -83,37 +85,37 @@ class SphereMethod(VisibilitySteps[Projected, FoundVisibility]):
         def lookups() -> Node:
             if self.emitter_cells is None:
                 return Node("", None)
-            return self_lookup_node(self, points.blocker_kinds, self.emitter_cells)
+            return self_lookup_node(self, context.blocker_kinds, self.emitter_cells)
 
         return Node(
             name,
             find_in_portions,
-            points.receivers_node,
-            blockers_node(self, points),
-            points.cached_with_neighbors("self-visibility towards emitters", None, lookups),
-            self.emitters.samples_node(points),
+            context.receivers_node,
+            blockers_node(self, context),
+            context.cached_with_neighbors("self-visibility towards emitters", None, lookups),
+            self.emitters.samples_node(context),
             self.emitters.radiance(materials),
             *others,
             items=lambda: f"{receiver_text(weak_points)} × {emitters.samples.first[-1]} samples",
         )
 
-    def known_shading_node(self, points: ShadingContext, light: LightInput) -> Node:
+    def known_shading_node(self, context: ShadingContext, light: LightInput) -> Node:
         """Direct known light on points."""
-        return ShadingNode(self, points, self.projected_light_node(points, light), light)
+        return ShadingNode(self, context, self.projected_light_node(context, light), light)
 
-    def openness_node(self, points: ShadingContext) -> Node:
+    def openness_node(self, context: ShadingContext) -> Node:
         """Light that points reflect as white surfaces under an even sky of 1, vec3 of shape [batch, receiver]."""
         sky = LightInput(EnvironmentMap.constant(1.0))
-        return ShadingNode(self, points, Node("", self.project_light, sky), sky, suffix=" in an even sky")
+        return ShadingNode(self, context, Node("", self.project_light, sky), sky, suffix=" in an even sky")
 
-    def transfer_node(self, points: ShadingContext, shell: Input | None) -> Node:
+    def transfer_node(self, context: ShadingContext, shell: Input | None) -> Node:
         """Transfer vectors of points: to the native basis if they require a gradient, else to :attr:`basis`.
 
         NumPy, which has no gradient, multiplies them by the matrix between both; with one, :meth:`_free_shading_node`
         converts the light instead.
         """
-        matrix, visibility_light = self.native_from_basis, self.free_basis_node(points, shell)
-        transfers = TransferNode(self, points, visibility_light, None, caches=matrix is None)
+        matrix, visibility_light = self.native_from_basis, self.free_basis_node(context, shell)
+        transfers = TransferNode(self, context, visibility_light, None, caches=matrix is None)
         if matrix is None or transfers.requires_grad:
             return transfers
 

@@ -37,7 +37,7 @@ class VisibilityNode(Node):
 
     Args:
         method: How light is blocked.
-        points: The receivers.
+        context: The receivers.
         projected_light: The light projected for the method.
         light: Known or free light; None where it is not given yet.
         caches: As for :class:`Node`.
@@ -53,7 +53,7 @@ class VisibilityNode(Node):
     def __init__(
         self,
         method: VisibilitySteps,
-        points: ShadingContext,
+        context: ShadingContext,
         projected_light: Node | ProjectedLight,
         light: Input | None,
         *,
@@ -62,10 +62,10 @@ class VisibilityNode(Node):
         result_of: Callable[[LitPortion], Any] = operator.attrgetter("result"),
         join: Callable[[list[Any]], Any] | None = None,
     ):
-        self.method, self._portions_of = method, find_portions_of(points)
+        self.method, self._portions_of = method, find_portions_of(context)
         self._result_of, self._join = result_of, self.join if join is None else join
-        self._progress, weak_points = method.progress and light is not None, points.weak_reference
-        suffix, planes = points.suffix if suffix is None else suffix, points.blocker_kinds.plane_bodies
+        self._progress, weak_points = method.progress and light is not None, context.weak_reference
+        suffix, planes = context.suffix if suffix is None else suffix, context.blocker_kinds.plane_bodies
         item_text = functools.partial(receiver_text, weak_points)
         rows = {
             "visibility": ExplainRow(
@@ -89,12 +89,12 @@ class VisibilityNode(Node):
         super().__init__(
             "",
             None,
-            points.receivers_node,
-            blockers_node(method, points),
+            context.receivers_node,
+            blockers_node(method, context),
             projected_light,
-            self_visibility_node(method, points, projected_light),
-            _static_shadows_node(method, points, light),
-            None if points.static_bodies is None else points.static_bodies.normals,
+            self_visibility_node(method, context, projected_light),
+            _static_shadows_node(method, context, light),
+            None if context.static_bodies is None else context.static_bodies.normals,
             rows=tuple(self._rows.values()),
             caches=caches,
         )
@@ -170,39 +170,39 @@ class ShadingNode(TransferNode):
         return portion._replace(result=result)
 
 
-def find_portions_of(points: ShadingContext, *, by_body: bool = False) -> Callable[..., Iterator[Group]]:
+def find_portions_of(context: ShadingContext, *, by_body: bool = False) -> Callable[..., Iterator[Group]]:
     """Make :func:`find_portions` for the receivers of points, without a reference to these."""
     return functools.partial(
-        find_portions, by_body=by_body, static_bodies=points.static_bodies, nearest_spheres=points.nearest_spheres
+        find_portions, by_body=by_body, static_bodies=context.static_bodies, nearest_spheres=context.nearest_spheres
     )
 
 
-def _why_unblocked(method: VisibilitySteps, points: ShadingContext) -> str:
+def _why_unblocked(method: VisibilitySteps, context: ShadingContext) -> str:
     """Reason why no visibility is computed; empty if it is."""
     if method.why_no_shadows:
         return method.why_no_shadows
-    blockers, kinds, static_bodies = method.scene_blockers, points.blocker_kinds, points.static_bodies
+    blockers, kinds, static_bodies = method.scene_blockers, context.blocker_kinds, context.static_bodies
     if not blockers.has_any(kinds):
         return f"no body {'but flat ones ' if kinds.plane_bodies else ''}has blockers"
-    moving, static, _ = points.counts()
+    moving, static, _ = context.counts()
     blocks_static = static_bodies and (method.adds_cached_rows or blockers.has_any(kinds, static_bodies.moving))
     if moving or (static and blocks_static):
         return ""
     return "no moving body has blockers" if static else "nothing is seen"
 
 
-def blockers_node(method: VisibilitySteps, points: ShadingContext) -> Node:
+def blockers_node(method: VisibilitySteps, context: ShadingContext) -> Node:
     """Node of the blockers around points, where they are in the world."""
-    place = functools.partial(method.scene_blockers.place_blockers, points.blocker_kinds)
-    return points.cached_with_neighbors("blockers", None, lambda: Node("", place, points.vertices, points.spheres))
+    place = functools.partial(method.scene_blockers.place_blockers, context.blocker_kinds)
+    return context.cached_with_neighbors("blockers", None, lambda: Node("", place, context.vertices, context.spheres))
 
 
 def self_visibility_node(
-    method: VisibilitySteps, points: ShadingContext, projected_light: Node | ProjectedLight
+    method: VisibilitySteps, context: ShadingContext, projected_light: Node | ProjectedLight
 ) -> Node:
     """Node of the receivers' self-visibility lookups, by body; the same for any receivers among the same bodies."""
-    make = functools.partial(self_lookup_node, method, points.blocker_kinds, projected_light)
-    return points.cached_with_neighbors("self-visibility", IdentityKey(projected_light), make)
+    make = functools.partial(self_lookup_node, method, context.blocker_kinds, projected_light)
+    return context.cached_with_neighbors("self-visibility", IdentityKey(projected_light), make)
 
 
 def self_lookup_node(
@@ -222,14 +222,14 @@ def self_lookup_node(
     return Node("self-shadows", functools.partial(method.self_lookups, bodies), rotations, projected_light, items=state)
 
 
-def _static_shadows_node(method: VisibilitySteps, points: ShadingContext, light: Input | None) -> Node:
+def _static_shadows_node(method: VisibilitySteps, context: ShadingContext, light: Input | None) -> Node:
     """Node of cached transmittance past static bodies; its value is None if there are none."""
-    static_bodies, weak_points = points.static_bodies, points.weak_reference
+    static_bodies, weak_points = context.static_bodies, context.weak_reference
     if static_bodies is None or not static_bodies.spheres[1].shape[1]:
         light_bounces = bool(method.merged_scene.scene.bounces)
         why = "light bounces: nothing of static bodies is cached" if light_bounces else "no static body has blockers"
         return Node("static shadows", None, idle=why)
-    rows = method.cached_rows(static_bodies, light, points.blocker_kinds)
+    rows = method.cached_rows(static_bodies, light, context.blocker_kinds)
 
     def missing() -> int:
         receivers = weak_points.receivers_node.value_if_known(weak_points.call)
@@ -238,7 +238,7 @@ def _static_shadows_node(method: VisibilitySteps, points: ShadingContext, light:
     return Node(
         "static shadows",
         rows.of_receivers,
-        detached(points.receivers_node),
+        detached(context.receivers_node),
         static_bodies.normals,
         items=lambda: f"up to {missing():,} vertices not seen before",
         idle=lambda: method.why_no_shadows or ("" if missing() else "cached: static bodies are the same"),

@@ -73,9 +73,9 @@ class SceneViews:
         other._set_cameras(cameras)
         return other
 
-    def call(self, points: ShadingContext | None = None) -> Call:
+    def call(self, context: ShadingContext | None = None) -> Call:
         """A call, with the cached values of points."""
-        return Call(self._clock, points.call if points else None, caches=not self._merged_scene.device.is_capturing)
+        return Call(self._clock, context.call if context else None, caches=not self._merged_scene.device.is_capturing)
 
     def view(self, geometry: Geometry | None = None, clip_matrices: wp.array | None = None) -> View:
         """The view of a geometry, with its receivers and silhouettes, which are found unless it is cached."""
