@@ -180,7 +180,7 @@ def test_the_page_of_tests_has_the_folders_shared_files_fixtures_and_tolerances_
     ]
 
 
-CACHING = ("cached", "_cached", "cached_with_neighbors", "cached_for_light")  # methods that take the node's name first
+CACHING = ("cached", "_cached", "cached_for_bodies", "cached_for_light")  # methods that take the node's name first
 
 
 def test_every_cached_node_stands_on_the_page_that_says_when_it_is_made_anew():

@@ -52,7 +52,7 @@ def launch(
         shared: Of a kernel that has a cost and Warp's own adjoint.
     """
     device = _device_of((*outputs, *sums, *inputs))
-    needs_gradient = kernel.options.get("enable_backward") is not False and varies(inputs)
+    needs_gradient = kernel.options.get("enable_backward") is not False and any_requires_grad(inputs)
     if needs_gradient:
         for output in outputs:
             if output is not None:
@@ -89,7 +89,7 @@ def differentiable(
     Returns:
         The result.
     """
-    if varies(variables):
+    if any_requires_grad(variables):
         require_gradient(result)
     forward(in_huge_pages(result))
     record_adjoint(lambda: adjoint(result.grad), [*variables, result])
@@ -155,7 +155,7 @@ def launch_with_adjoint(
     )
 
 
-def varies(values: Iterable[Any]) -> bool:
+def any_requires_grad(values: Iterable[Any]) -> bool:
     """Whether one of some values is an array that requires a gradient."""
     for value in values:  # noqa: SIM110  (any takes twice as long)
         if isinstance(value, wp.array) and value.requires_grad:

@@ -31,7 +31,7 @@ def candidates_anywhere(model: Model, values: Mapping[str, Values], count: int, 
     with torch.no_grad():
         world = model.world(values)
         for pose in poses:
-            world.take_away(pose.number, model.context)
+            world.move_out_of_view(pose.number, model.context)
         target, image = model.targets[0], world.images()[0]
         squares = (image[..., : target.shape[-1]] - target).square().sum(dim=-1) * model.weights[0]
     probabilities = squares.double().flatten().numpy(force=True) + 1e-12

@@ -83,7 +83,7 @@ class _Descent:
         self.seed = seed
         self.context = problem.context(device, progress=progress)
         self.stage = 0
-        self.is_found = False
+        self.has_standout = False
         self.candidates = self._candidates_of_stage([_Candidate(problem.start(self.context), None)])
         self.ended: list[_FinishedRun] = []
         self.losses: list[list[float]] = []
@@ -109,7 +109,7 @@ class _Descent:
 
     def _candidate_count(self, stage: Stage) -> int:
         """Candidates of a stage: one that stood out is not turned any more."""
-        return 1 if self.is_found and stage.scatter == "turned" else stage.candidates
+        return 1 if self.has_standout and stage.scatter == "turned" else stage.candidates
 
     def _perturbed_candidates(self, values: Mapping[str, Values], count: int) -> list[dict[str, Values]]:
         scatter = self.stages[self.stage].scatter
@@ -153,7 +153,7 @@ class _Descent:
             "fingerprints": self.fingerprints,
             "stage": self.stage,
             "candidates": [tuple(candidate) for candidate in self.candidates],
-            "is_found": self.is_found,
+            "has_standout": self.has_standout,
             "ended": [tuple(run) for run in self.ended],
             "values": _copy_values(self.values),
             "best": self.best,
@@ -183,7 +183,7 @@ class _Descent:
         device = self.context.device
         self.stage = state["stage"]
         self.candidates = [_Candidate(_copy_values(values, device), *fields) for values, *fields in state["candidates"]]
-        self.is_found = state["is_found"]
+        self.has_standout = state["has_standout"]
         self.begin_stage()
         self._begin_run(_Candidate(_copy_values(state["values"], device), None))
         self.optimizer.load_state_dict(state["optimizer"])
@@ -214,7 +214,7 @@ class _Descent:
         if not is_over:
             return True
         self.ended.append(self._ended_run())
-        self.is_found = self.is_found or (len(self.candidates) > 1 and self._is_clearly_best(self.ended[-1]))
+        self.has_standout = self.has_standout or (len(self.candidates) > 1 and self._is_clearly_best(self.ended[-1]))
         if len(self.ended) < min(len(self.candidates), self._candidate_count(stage)):
             self._begin_run(self.candidates[len(self.ended)])
             self.losses.append([])

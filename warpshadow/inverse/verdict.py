@@ -159,7 +159,7 @@ def explained_shares(model: Model, values: Mapping[str, Values], images: torch.T
                 result[number] = outlined_shares[number]
                 continue
             world = model.world(values)
-            world.take_away(number, model.context)
+            world.move_out_of_view(number, model.context)
             changes = (_in_units(model, world.images()) - images).norm(dim=-1) * (model.weights > 0)
             is_changed = changes > max(_SEEN_CHANGE * float(changes.max()), _LEAST_CHANGE)
             elsewhere = residuals[~is_changed & (model.weights > 0)]

@@ -136,7 +136,7 @@ class World:
         poses = (torch.stack(parts) for parts in (self.rotations, self.translations, self.scales))
         return self.renderer.placed(*poses, rest=self.rest, moving=self.moving)
 
-    def take_away(self, number: int, context: FitContext) -> None:
+    def move_out_of_view(self, number: int, context: FitContext) -> None:
         """Move a body so far that neither it nor its shadow is seen."""
         away = _FAR * float(context.distances.max()) * torch.eye(3, device=context.device)[1]
         self.translations[number] = self.translations[number] - away

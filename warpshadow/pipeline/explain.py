@@ -126,7 +126,7 @@ def decide_which_nodes_run(image: Node, call: Call) -> dict[Node, Decision]:
 
 def _decision(node: Node, call: Call, reason: Decision) -> Decision:
     """Whether a node runs, given why it is asked for, or why it is not."""
-    if node.row is not None and (idle := _text(node.row.idle)):
+    if node.row is not None and (idle := _text(node.row.why_idle)):
         return Decision(False, idle)
     if node.value_if_known(call) is not None:
         return Decision(False, f"cached: {_names(node.root_inputs)} are the same")
@@ -149,7 +149,7 @@ def _row_decision(row: ExplainRow, node: Node, decision: Decision) -> Decision:
     """Whether a row of a node runs, given the decision about the node."""
     if row is node.row:
         return decision
-    if idle := _text(row.idle):
+    if idle := _text(row.why_idle):
         return Decision(False, idle)
     return _reason_to_run(row.inputs, decision)
 

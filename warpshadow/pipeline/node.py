@@ -114,13 +114,13 @@ class ExplainRow(NamedTuple):
     A named node is one row. Further rows are steps that its function times itself, and steps that it makes needless,
     which are idle.
 
-    Items and idle may be functions that make the words.
+    Items and why_idle may be functions that make the words.
     """
 
     name: str
     items: str | Callable[[], str] = ""  # on how many items it is computed, in words
-    idle: str | Callable[[], str] = ""  # why there is nothing to do, in words
-    has_adjoint: bool = True  # whether gradients take it more than to hand them on
+    why_idle: str | Callable[[], str] = ""  # why there is nothing to do, in words
+    has_adjoint: bool = True  # whether its adjoint launches kernels
     inputs: "tuple[AnyInput, ...]" = ()  # its inputs, where they are fewer than its node's
 
 
@@ -131,7 +131,7 @@ class Node:
         name: Name of its own row of ``explain``; empty for a node that is neither timed nor explained.
         function: Computes the value from the inputs' values; None where there is nothing to compute: the value is None.
         inputs: Nodes and inputs of the pipeline; anything else is passed on as it is.
-        items, idle, has_adjoint: As for :class:`ExplainRow`; a function of an idle node passes something on.
+        items, why_idle, has_adjoint: As for :class:`ExplainRow`; an idle node still calls its function, untimed.
         caches: Whether the value may outlive a call.
         extra_inputs: Other nodes that run for this one.
         rows: Further rows, before its own.
@@ -150,14 +150,14 @@ class Node:
         function: Callable[..., Any] | None,
         *inputs: Any,
         items: str | Callable[[], str] = "",
-        idle: str | Callable[[], str] = "",
+        why_idle: str | Callable[[], str] = "",
         has_adjoint: bool = True,
         caches: bool = True,
         extra_inputs: tuple["Node", ...] = (),
         rows: tuple[ExplainRow, ...] = (),
     ):
         self.function, self.inputs = function, inputs
-        self.row = ExplainRow(name, items, idle, has_adjoint) if name else None
+        self.row = ExplainRow(name, items, why_idle, has_adjoint) if name else None
         self.rows = rows if self.row is None else (*rows, self.row)
         self.dependencies: list[AnyInput] = []
         self.root_inputs: dict[Input, None] = {}  # in order
@@ -192,7 +192,7 @@ class Node:
         if self.function is None:
             return None
         values = self.values(call)
-        if self.row is None or isinstance(self.row.idle, str) and self.row.idle:
+        if self.row is None or isinstance(self.row.why_idle, str) and self.row.why_idle:
             return self.function(*values)
         with self.timed(call, self.row):
             return self.function(*values)
@@ -200,8 +200,8 @@ class Node:
     def timed(self, call: "Call", row: ExplainRow) -> AbstractContextManager[None]:
         """Time one of its rows while it computes its value."""
         inputs = row.inputs or (self,)
-        is_marked = row.has_adjoint and any(item.differentiated_inputs for item in inputs)
-        return call.timed(row.name, is_marked=is_marked)
+        times_adjoint = row.has_adjoint and any(item.differentiated_inputs for item in inputs)
+        return call.timed(row.name, times_adjoint=times_adjoint)
 
     def values(self, call: "Call") -> list[Any]:
         """The values of the inputs."""
@@ -288,7 +288,7 @@ class Call(dict[Node, Any]):
         self._timings: dict[str, Timing] = {}
 
     @contextlib.contextmanager
-    def timed(self, name: str, *, is_marked: bool) -> Iterator[None]:
+    def timed(self, name: str, *, times_adjoint: bool) -> Iterator[None]:
         """Time a stage, or one more part of a stage that has run in this call.
 
         Its adjoint is timed by marks on the tape.
@@ -304,10 +304,10 @@ class Call(dict[Node, Any]):
         def start_adjoint() -> None:
             timing.adjoints[part] = -now()
 
-        if is_marked:
+        if times_adjoint:
             record(end_adjoint)  # the tape plays back from the end
         start = now()
         yield
-        if is_marked:
+        if times_adjoint:
             record(start_adjoint)
         timing.forward += now() - start

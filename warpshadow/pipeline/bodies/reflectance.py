@@ -83,7 +83,7 @@ class BodyTextures:
             lambda _: mip_pyramids([*map(as_colors, images)], coarsest=coarsest()),
             self._source,
             items=lambda: f"{sum(image.size for image in images):,} texels",
-            idle=why_flat,
+            why_idle=why_flat,
         )
 
     def footprints(self, fragments: Node, clip_positions: Node, pyramids: Node, items: str) -> Node:
@@ -259,7 +259,7 @@ class Materials:
 
     def untextured_reflectance(self, fragments: Node, items: str) -> SampleReflectance:
         """Nodes of the samples' reflectance where no body has a texture."""
-        none = [Node(name, None, idle="no body has a texture") for name in ("mip pyramids", "footprints")]
+        none = [Node(name, None, why_idle="no body has a texture") for name in ("mip pyramids", "footprints")]
         seen = fragments, self.merged_scene.faces, self.vertex_albedo
         samples = Node("reflectance", interpolate, *seen, items=items, extra_inputs=tuple(none))
         return SampleReflectance(samples, self.vertex_albedo, *none)

@@ -143,7 +143,7 @@ class BounceGatherer:
         """
         light = portion.direct
         for row, function in zip(self.rows, self._functions, strict=True):
-            if not row.idle:
+            if not row.why_idle:
                 with node.timed(call, row):
                     light = function(portion.group, portion.transmittance, outgoing, light)
         return light

@@ -148,7 +148,7 @@ class Radiosity(Node):
         portions, albedo, placed_proxies, frames, weights = self.values(call)
         senders, count = self._proxies.senders, self._count
         self_factors = None  # between patches of one body
-        if not self._self_reflection.idle:
+        if not self._self_reflection.why_idle:
             self_factors = self._self_form_factors.between_patches(senders, [portion.group for portion in portions])
         if self_factors is not None and self_factors.is_zero:
             self_factors = None
@@ -237,7 +237,7 @@ class MovingBounces:
         projected_light = method.projected_light_node(context, light)
         if not senders.bodies:
             direct = ShadingNode(method, context, projected_light, light)
-            return Node("bounces", identity, direct, idle="every body is black")
+            return Node("bounces", identity, direct, why_idle="every body is black")
         make_visibility = self._visibility_maker(context, light)
         key, is_cached = light.visibility_key, light.is_free or materials is not context.materials
         visibility = context.cached("visibility", (key, is_cached), lambda: make_visibility(context, caches=is_cached))

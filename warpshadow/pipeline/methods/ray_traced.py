@@ -55,7 +55,7 @@ class RayTraced(Method):
             light,
             self.shell_of(light),
             items=functools.partial(receiver_text, context.weak_reference),
-            rows=(ExplainRow("transfer", idle="rays shade known light at once"),),
+            rows=(ExplainRow("transfer", why_idle="rays shade known light at once"),),
         )
 
     def path_shading_node(self, direct: Node, context: ShadingContext, light: LightInput, materials: Materials) -> Node:
@@ -129,7 +129,7 @@ class RayTraced(Method):
         """Node of the trees of all vertices around points."""
         name, vertices = "visibility" if self.shares_directions else "", context.vertices
         items = f"{len(self.merged_scene.body_of_face):,} faces"
-        return context.cached_with_neighbors("trees", None, lambda: Node(name, self._trees, vertices, items=items))
+        return context.cached_for_bodies("trees", None, lambda: Node(name, self._trees, vertices, items=items))
 
     def _trees(self, positions: wp.array) -> list[FaceTree]:
         """Hierarchies of the blockers, for packets of rays."""
@@ -148,9 +148,9 @@ class RayTraced(Method):
                 context.vertices,
                 detached(context.receivers_node),
                 items=lambda: f"{receiver_text(weak_points)} by rays",
-                idle="" if self.merged_scene.shadow_casters else "no body has blockers",
+                why_idle="" if self.merged_scene.shadow_casters else "no body has blockers",
                 caches=False,
-                rows=(ExplainRow("static shadows", idle="rays treat all receivers alike"),),
+                rows=(ExplainRow("static shadows", why_idle="rays treat all receivers alike"),),
             )
 
         return context.cached("meshes", None, meshes)

@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, cut, expand
-from warpshadow.device.launch import varies
+from warpshadow.device.launch import any_requires_grad
 from warpshadow.pipeline.bodies.scene_planes import BodySides
 from warpshadow.pipeline.bodies.self_visibility import SelfLookup, SelfVisibilityLookup
 from warpshadow.stages.convex.convex_blockers import ConvexBlockers, PlacedParts
@@ -288,7 +288,7 @@ class Group:
             blockers = self.blockers._replace(spheres=spheres)
             group = self._with_arrays(lambda array: expand(array, count), blockers=blockers)
         is_whole = self.cached_rows is not None or size <= RECEIVERS_AT_ONCE
-        if is_whole or varies([self.points, self.normals, *placed_arrays.values()]):
+        if is_whole or any_requires_grad([self.points, self.normals, *placed_arrays.values()]):
             yield group
             return
         for spans in _cut_spans(self.spans or (Span(-1, 0, size),)):

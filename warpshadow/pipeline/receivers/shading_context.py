@@ -103,7 +103,7 @@ class ShadingContext:
         """The value cached under a name, whatever it was made from; None without one."""
         return self._cached.get(name, (None, None))[1]
 
-    def cached_with_neighbors(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
+    def cached_for_bodies(self, name: str, key: Hashable, make: Callable[[], Cached]) -> Cached:
         """A cached value that all points among the same bodies share."""
         return _cached(self._cached_with_neighbors, name, key, make)
 

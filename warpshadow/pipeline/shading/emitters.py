@@ -182,7 +182,7 @@ class SceneEmitters:
 
     def samples_node(self, context: ShadingContext) -> Node:
         """Node of the samples among the bodies around points."""
-        return context.cached_with_neighbors("emitters", None, lambda: Node("", self._place, context.vertices))
+        return context.cached_for_bodies("emitters", None, lambda: Node("", self._place, context.vertices))
 
     def _place(self, vertices: wp.array) -> PlacedSamples:
         return place_samples(vertices, self.samples)

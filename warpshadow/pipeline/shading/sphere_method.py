@@ -39,7 +39,7 @@ class SphereMethod(VisibilitySteps[Projected, FoundVisibility]):
         if light is self.light:
             return self._projected_scene_light
         make = functools.partial(Node, "", self.project_light, light, self.shell_of(light))
-        return context.cached_with_neighbors("projected", light, make)
+        return context.cached_for_bodies("projected", light, make)
 
     def visibility_basis_node(self, context: ShadingContext, light: LightInput) -> Node | Projected:
         """The light by which visibility is found, projected: known light, or any free light of the same shell."""
@@ -52,7 +52,7 @@ class SphereMethod(VisibilitySteps[Projected, FoundVisibility]):
         if shell is None:
             return self.free_basis
         make = functools.partial(Node, "", self.free_basis_of_shell, shell)
-        return context.cached_with_neighbors("free basis", shell, make)
+        return context.cached_for_bodies("free basis", shell, make)
 
     def _with_free_light(self, light: wp.array, free_basis: Projected) -> Projected:
         """Project given free light for the method. Differentiable: light."""
@@ -92,7 +92,7 @@ class SphereMethod(VisibilitySteps[Projected, FoundVisibility]):
             find_in_portions,
             context.receivers_node,
             blockers_node(self, context),
-            context.cached_with_neighbors("self-visibility towards emitters", None, lookups),
+            context.cached_for_bodies("self-visibility towards emitters", None, lookups),
             self.emitters.samples_node(context),
             self.emitters.radiance(materials),
             *others,

@@ -194,7 +194,7 @@ def _why_unblocked(method: VisibilitySteps, context: ShadingContext) -> str:
 def blockers_node(method: VisibilitySteps, context: ShadingContext) -> Node:
     """Node of the blockers around points, where they are in the world."""
     place = functools.partial(method.scene_blockers.place_blockers, context.blocker_kinds)
-    return context.cached_with_neighbors("blockers", None, lambda: Node("", place, context.vertices, context.spheres))
+    return context.cached_for_bodies("blockers", None, lambda: Node("", place, context.vertices, context.spheres))
 
 
 def self_visibility_node(
@@ -202,7 +202,7 @@ def self_visibility_node(
 ) -> Node:
     """Node of the receivers' self-visibility lookups, by body; the same for any receivers among the same bodies."""
     make = functools.partial(self_lookup_node, method, context.blocker_kinds, projected_light)
-    return context.cached_with_neighbors("self-visibility", IdentityKey(projected_light), make)
+    return context.cached_for_bodies("self-visibility", IdentityKey(projected_light), make)
 
 
 def self_lookup_node(
@@ -212,7 +212,7 @@ def self_lookup_node(
     bodies, rotations, blockers = blocker_kinds.self_traced, blocker_kinds.rotations, method.scene_blockers
     curved_bodies = [body for body in bodies if not method.merged_scene.is_flat[body]]
     if not curved_bodies or rotations is None:
-        return Node("self-shadows", None, idle=lambda: blockers.why_none_is_traced(blocker_kinds))
+        return Node("self-shadows", None, why_idle=lambda: blockers.why_none_is_traced(blocker_kinds))
 
     def state() -> str:
         missing = blockers.self_visibility.missing(bodies)
@@ -228,7 +228,7 @@ def _static_shadows_node(method: VisibilitySteps, context: ShadingContext, light
     if static_bodies is None or not static_bodies.spheres[1].shape[1]:
         light_bounces = bool(method.merged_scene.scene.bounces)
         why = "light bounces: nothing of static bodies is cached" if light_bounces else "no static body has blockers"
-        return Node("static shadows", None, idle=why)
+        return Node("static shadows", None, why_idle=why)
     rows = method.cached_rows(static_bodies, light, context.blocker_kinds)
 
     def missing() -> int:
@@ -241,6 +241,6 @@ def _static_shadows_node(method: VisibilitySteps, context: ShadingContext, light
         detached(context.receivers_node),
         static_bodies.normals,
         items=lambda: f"up to {missing():,} vertices not seen before",
-        idle=lambda: method.why_no_shadows or ("" if missing() else "cached: static bodies are the same"),
+        why_idle=lambda: method.why_no_shadows or ("" if missing() else "cached: static bodies are the same"),
         caches=False,
     )

@@ -114,7 +114,7 @@ class View(ShadingContext):
             side_inputs = fragments, faces, two_sided, detached(vertices), detached(cameras)
             sides = Node("sides", find_sides, *side_inputs, items=samples, has_adjoint=False)
         else:
-            sides = Node("sides", identity, fragments, idle="every body is closed: none is seen from behind")
+            sides = Node("sides", identity, fragments, why_idle="every body is closed: none is seen from behind")
         edge_inputs = merged_scene.face_neighbors, clip, merged_scene.face_bodies, merged_scene.creases
         silhouettes = Node(
             "silhouettes", find_silhouettes, sides, faces, *edge_inputs, items=samples, has_adjoint=False
@@ -149,7 +149,7 @@ class View(ShadingContext):
         shading, reflectance = self.shading(light, materials), self._moving_reflectance(materials)
         shines = materials.roughness or materials.emission
         if not shines and reflectance.pyramids.requires_grad and not (shading.requires_grad or clip.requires_grad):
-            replaced_rows = (ExplainRow("reflectance", idle="found with the radiance"),)
+            replaced_rows = (ExplainRow("reflectance", why_idle="found with the radiance"),)
             samples = Node(
                 "radiance",
                 textured_radiance,
@@ -173,13 +173,13 @@ class View(ShadingContext):
 
     def _moving_reflectance(self, materials: Materials) -> SampleReflectance:
         """Nodes of the reflectance that :meth:`_radiance` takes, whose patterns move by mean slopes near outlines."""
-        return self._reflectance_of(materials, self._fragments_of_patterns(materials)[0])
+        return self._reflectance_of(materials, self._fragments_for_color_motion(materials)[0])
 
     def _reflectance_of(self, materials: Materials, fragments: Node) -> SampleReflectance:
         make_nodes = functools.partial(self._find_reflectance, materials, fragments)
         return self.cached("reflectance", fragments, make_nodes) if materials is self.materials else make_nodes()
 
-    def _fragments_of_patterns(self, materials: Materials) -> tuple[Node, Node | None]:
+    def _fragments_for_color_motion(self, materials: Materials) -> tuple[Node, Node | None]:
         """Nodes of the fragments by which colors move, and of the samples whose colors have mean slopes instead.
 
         None have them, and the latter is None, where nothing moves or each body has one color, which moves by neither.
@@ -233,7 +233,7 @@ class View(ShadingContext):
             reflected = self._radiance(shading, reflectance, materials)
         if not materials.emission:
             return reflected
-        emission = self._emission(materials, self._fragments_of_patterns(materials)[0])
+        emission = self._emission(materials, self._fragments_for_color_motion(materials)[0])
         emitted = self._radiance(Node("", _white_shading, self.receivers_node), emission, materials)
         return self._sum_of(reflected, emitted)
 
@@ -286,14 +286,19 @@ class View(ShadingContext):
         return wp.full((1, height, width), wp.vec3(1.0), dtype=wp.vec3, device=self.merged_scene.device)
 
     def in_photograph(
-        self, photograph: Input | None, unshadowed: Input, catches: wp.array, light: LightInput, materials: Materials
+        self,
+        photograph: Input | None,
+        unshadowed: Input,
+        face_is_catcher: wp.array,
+        light: LightInput,
+        materials: Materials,
     ) -> Node:
         """The image in a photograph that the catchers model: linear RGB, vec3 of shape [batch, height, width].
 
         Args:
             photograph: Linear RGB, vec3 of shape [batch, height, width]; None for nothing, where shadows are coverage,
                 vec4.
-            unshadowed, catches: ``catcher_light`` and ``is_catcher`` of
+            unshadowed, face_is_catcher: ``catcher_light`` and ``is_catcher`` of
                 :func:`warpshadow.stages.image.photograph.find_ratio_image`.
             light, materials: As for :meth:`image`.
         """
@@ -302,7 +307,7 @@ class View(ShadingContext):
         shading, reflectance = self.shading(light, materials), self._moving_reflectance(materials)
 
         def divide(fragments: Fragments, samples: wp.array, catcher_light: wp.array) -> "RatioImage":
-            return find_ratio_image(fragments.face_ids, catches, samples, catcher_light)
+            return find_ratio_image(fragments.face_ids, face_is_catcher, samples, catcher_light)
 
         fragments = detached(self.fragments_node)
         ratio = Node("ratio", divide, fragments, reflectance.samples, unshadowed, items=self._sample_text, caches=False)
@@ -338,7 +343,7 @@ class View(ShadingContext):
         """Node of the samples; given materials, the reflectance belongs to surfaces, with which it moves."""
         make_node = functools.partial(Node, "radiance", items=self._sample_text, caches=False)
         if self._is_moving:
-            is_near_outline = None if materials is None else self._fragments_of_patterns(materials)[1]
+            is_near_outline = None if materials is None else self._fragments_for_color_motion(materials)[1]
             moving = self.silhouettes, self.clip_positions, is_near_outline
             return make_node(_moving_radiance, self.receivers_node, shading, reflectance, *moving)
         return make_node(_radiance, self.receivers_node, shading, reflectance)
@@ -349,7 +354,7 @@ class View(ShadingContext):
         smooth = _smooth_moving if is_moving else smooth_silhouettes
         smoothed = make_node("smoothing", smooth, samples, self.silhouettes, self.clip_positions)
         if self._supersampling == 1:
-            return Node("averaging", identity, smoothed, idle="a pixel has one sample", caches=False)
+            return Node("averaging", identity, smoothed, why_idle="a pixel has one sample", caches=False)
         return make_node("averaging", average, smoothed, self._supersampling)
 
     def _white_radiance_of(self, shading: Node) -> Node:

@@ -23,7 +23,7 @@ import warp as wp
 from warpshadow import check
 from warpshadow.device.batch import common_batch, expand, instance_in
 from warpshadow.device.lanes import lane_type, make_lane_functions, module_options, sector_count, vectors_type
-from warpshadow.device.launch import launch_with_adjoint, varies
+from warpshadow.device.launch import any_requires_grad, launch_with_adjoint
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import Scratch, run_dimensions, scratch_slot, split_launch
 from warpshadow.maths.directions import BUNDLE, cell_radius
@@ -69,7 +69,7 @@ def _task_type(lanes: int) -> Any:
     class LightTask:
         cells: DirectionCells
         first_bundle: int
-        stops: wp.array(dtype=wp.int32)  # [bundle] 0 where nothing is blocked, else the traversal's end
+        opaque_from: wp.array(dtype=wp.int32)  # [bundle] 0 where nothing is blocked, else the traversal's end
         reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a cluster, may reach
         blocked: wp.array(dtype=Lane)  # [direction] F − T
         transmittance_others: wp.array(dtype=Lane)  # [direction] F, until F − T is loaded
@@ -149,7 +149,7 @@ def _make_load_task(lanes: int) -> wp.Function:
         task.cells = inputs.cells
         task.first_bundle = sector * (scratch.shape[2] // BUNDLE)
         task.reached_bundles = reached_bundles[slot]
-        task.stops = reached_bundles[slot, 2]
+        task.opaque_from = reached_bundles[slot, 2]
         task.blocked = scratch[slot, 0]
         task.factors = scratch[slot, 0]
         task.transmittance_others = scratch[slot, 1]
@@ -164,11 +164,11 @@ def _make_load_task(lanes: int) -> wp.Function:
         for run in range(spheres.run_bounds.shape[1]):
             largest_radius = wp.max(largest_radius, spheres.run_bounds[batch, run][3])
         task.weights.inverse_size = 1.0 / largest_radius
-        for bundle in range(task.stops.shape[0]):
-            task.stops[bundle] = 0
+        for bundle in range(task.opaque_from.shape[0]):
+            task.opaque_from[bundle] = 0
             is_above = is_bundle_above(task.cells, task.first_bundle + bundle, receivers.normals)
             if is_above and load_blocked(block, bundle, inputs, task):
-                task.stops[bundle] = spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
+                task.opaque_from[bundle] = spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
         return block, receivers, task
 
     return load_task
@@ -238,14 +238,14 @@ def _make_light(lanes: int) -> wp.Kernel:
         i, j = wp.tid()
         sector, row = split_launch(worker, first_row + i, j)
         block, receivers, task = load_task(row, sector, worker, inputs, scratch, reached_bundles, sums)
-        for bundle in range(task.stops.shape[0]):
-            if task.stops[bundle] > 0:
+        for bundle in range(task.opaque_from.shape[0]):
+            if task.opaque_from[bundle] > 0:
                 for k in range(BUNDLE * SUMS):
                     task.sums[bundle * BUNDLE * SUMS + k] = Lane(0.0)
         traverse(receivers, block.batch, inputs.traversed.spheres, Gradients(), task)
         light_sum = Vectors()
-        for bundle in range(task.stops.shape[0]):
-            if task.stops[bundle] > 0:
+        for bundle in range(task.opaque_from.shape[0]):
+            if task.opaque_from[bundle] > 0:
                 for i in range(BUNDLE):
                     slot = bundle * BUNDLE + i
                     omega = task.cells.directions[(task.first_bundle + bundle) * BUNDLE + i]
@@ -373,8 +373,8 @@ def _make_light_adjoint(lanes: int) -> wp.Kernel:
         if adj_equations:
             task.weights.adj_equations = adj_equations[instance_in(batch, adj_equations.shape[0])]
         adj_normal = Vectors()
-        for bundle in range(task.stops.shape[0]):
-            if task.stops[bundle] > 0:
+        for bundle in range(task.opaque_from.shape[0]):
+            if task.opaque_from[bundle] > 0:
                 adj_normal = add(adj_normal, bundle_adjoint(receivers, bundle, inputs.factor, task))
                 first_slot = bundle * BUNDLE
                 first_direction = (task.first_bundle + bundle) * BUNDLE
@@ -463,7 +463,7 @@ def sphere_light(
     addend = None if addend is None else expand(addend, len(points))
     variables = [points, normals, transmittance, addend, *([] if is_shared else [transmittance_others])]
     shared = [*([transmittance_others] if is_shared else []), proxy_radiance, equations, *traversal.nodes]
-    stores_sums = varies([*variables, *shared])
+    stores_sums = any_requires_grad([*variables, *shared])
     scratch = [
         Scratch((3, sector_direction_count), lane_type(lanes)),
         Scratch((3, sector_direction_count // BUNDLE), wp.int32),

@@ -32,7 +32,7 @@ from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in
 from warpshadow.device.constants import constant
 from warpshadow.device.lanes import lane_count, lane_type, make_lane_functions, module_options, vectors_type
-from warpshadow.device.launch import launch, varies
+from warpshadow.device.launch import any_requires_grad, launch
 from warpshadow.device.memory import empty, in_huge_pages, require_gradient
 from warpshadow.device.parallel import split_row
 from warpshadow.device.tape import record_adjoint
@@ -453,7 +453,7 @@ def sample_lobes(
     sample, sample_adjoint = _make_sample_lobes(lanes)
     dtypes = wp.vec3, wp.vec2, wp.float32
     results = [wp.empty((*shape, sample_count), dtype=dtype, device=device) for dtype in dtypes]
-    if varies(lobes):
+    if any_requires_grad(lobes):
         for result in results:
             require_gradient(result)
     launch(sample, rows, inputs=sampled, outputs=[*map(in_huge_pages, results)], cost=cost)

@@ -12,7 +12,7 @@ import warp as wp
 
 from warpshadow import check
 from warpshadow.device.batch import common_batch, instance_in, rows
-from warpshadow.device.launch import differentiable, launch, varies
+from warpshadow.device.launch import any_requires_grad, differentiable, launch
 from warpshadow.device.memory import empty
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.raster.interpolation import (
@@ -376,11 +376,11 @@ def sample_albedo(
     sample_inputs = _make_sample_inputs(textures, footprints, fragments, faces)
 
     def adjoint(adj_albedo: wp.array) -> None:
-        if varies(colors):
+        if any_requires_grad(colors):
             inputs = [sample_inputs, None, rows(adj_albedo), None]
             outputs = [array.grad for array in colors]
             launch(_sample_adjoint_by_colors, _runs(adj_albedo), inputs=inputs, outputs=outputs)
-        if varies(coordinates):
+        if any_requires_grad(coordinates):
             inputs = [sample_inputs, *colors, rows(adj_albedo)]
             outputs = [rows(array.grad) for array in coordinates]
             launch(_sample_adjoint_by_coordinates, _runs(adj_albedo), inputs=inputs, outputs=outputs)

@@ -167,7 +167,7 @@ def make_cull(has_horizon: bool, Task: type, lanes: int, has_footprints: bool = 
         Task: Struct that has
 
             - ``cells`` and ``first_bundle``: the thread's bundles begin there;
-            - ``stops`` [bundle], int32: the traversal index from which on no sphere matters to a bundle;
+            - ``opaque_from`` [bundle], int32: the traversal index from which on no sphere matters to a bundle;
             - ``reached_bundles`` [2, bundle], int32: bundles that a run, and then a cluster, may reach, where they are
               listed.
 
@@ -196,13 +196,13 @@ def make_cull(has_horizon: bool, Task: type, lanes: int, has_footprints: bool = 
             if is_within or is_above_horizon(cap, receivers.normals):
                 candidate_count = candidates
                 if candidates == ALL_BUNDLES:
-                    candidate_count = task.stops.shape[0]
+                    candidate_count = task.opaque_from.shape[0]
                 for k in range(candidate_count):
                     bundle = k
                     if candidates != ALL_BUNDLES:
                         bundle = task.reached_bundles[0, k]
                     direction_bundle = task.first_bundle + bundle
-                    is_candidate = task.stops[bundle] > traversal_index
+                    is_candidate = task.opaque_from[bundle] > traversal_index
                     if is_candidate and (
                         is_within
                         or reaches_bundle(cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle])

@@ -72,7 +72,7 @@ def _task_type(lanes: int) -> Any:
     class TransmittanceTask:
         cells: DirectionCells
         first_bundle: int
-        stops: wp.array(dtype=wp.int32)  # [bundle] the traversal index from which on nothing is left to block
+        opaque_from: wp.array(dtype=wp.int32)  # [bundle] the traversal index from which on nothing is left to block
         reached_bundles: wp.array2d(dtype=wp.int32)  # bundles that a run, and then a cluster, may reach
         transmittances: wp.array(dtype=Lane)  # [direction] transmittance; for the adjoint its product with its adjoint
 
@@ -93,7 +93,7 @@ def _make_load_task(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.F
         worker: int,
         inputs: TraversalInputs,
         cells: DirectionCells,
-        all_stops: wp.array3d(dtype=wp.int32),
+        opaque_rows: wp.array3d(dtype=wp.int32),
         scratch: wp.array2d(dtype=Lane),
         reached_bundles: wp.array3d(dtype=wp.int32),
     ):
@@ -103,9 +103,11 @@ def _make_load_task(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.F
             for direction in range(cells.directions.shape[0]):
                 receivers.footprints += wp.abs(dot_direction(cells.directions[direction], footprints))
             receivers.footprints = receivers.footprints / float(cells.directions.shape[0])
-        slot = scratch_slot(worker, row * all_stops.shape[1] + sector)
-        stops = all_stops[row, sector]
-        task = TransmittanceTask(cells, sector * stops.shape[0], stops, reached_bundles[slot], scratch[slot])
+        slot = scratch_slot(worker, row * opaque_rows.shape[1] + sector)
+        opaque_from = opaque_rows[row, sector]
+        task = TransmittanceTask(
+            cells, sector * opaque_from.shape[0], opaque_from, reached_bundles[slot], scratch[slot]
+        )
         return block, receivers, task
 
     return load_task
@@ -158,11 +160,11 @@ def _make_transmit(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.Ke
             for k in range(count):
                 bundle = task.reached_bundles[1, k]
                 direction_bundle = task.first_bundle + bundle
-                is_candidate = task.stops[bundle] > sphere_view.traversal_index and reaches_bundle(
+                is_candidate = task.opaque_from[bundle] > sphere_view.traversal_index and reaches_bundle(
                     cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]
                 )
                 if is_candidate and not attenuate(cap, slope, opacity, bundle, task):
-                    task.stops[bundle] = sphere_view.traversal_index + 1
+                    task.opaque_from[bundle] = sphere_view.traversal_index + 1
 
     cull = make_cull(has_horizon, TransmittanceTask, lanes, has_footprints)
     traverse = make_traversal(cull, visit, TransmittanceTask, False, lanes)
@@ -180,21 +182,21 @@ def _make_transmit(has_horizon: bool, has_footprints: bool, lanes: int) -> wp.Ke
         scratch: wp.array2d(dtype=Lane),
         reached_bundles: wp.array3d(dtype=wp.int32),
         # out
-        all_stops: wp.array3d(dtype=wp.int32),
+        opaque_rows: wp.array3d(dtype=wp.int32),
         transmittance: wp.array3d(dtype=wp.float32),
     ):
-        """A thread owns a block of receivers and a sector of directions; stops are spheres where it stopped looking."""
+        """A thread owns a block of receivers and a sector of directions; past ``opaque_rows`` no sphere counts."""
         i, j = wp.tid()
         sector, row = split_launch(worker, first_row + i, j)
-        block, receivers, task = load_task(row, sector, worker, inputs, cells, all_stops, scratch, reached_bundles)
-        for bundle in range(task.stops.shape[0]):
+        block, receivers, task = load_task(row, sector, worker, inputs, cells, opaque_rows, scratch, reached_bundles)
+        for bundle in range(task.opaque_from.shape[0]):
             for cell in range(BUNDLE):
                 task.transmittances[bundle * BUNDLE + cell] = Lane(1.0)
-            task.stops[bundle] = 0  # wholly below the horizon: the cosine is zero there
+            task.opaque_from[bundle] = 0  # wholly below the horizon: the cosine is zero there
             if is_bundle_above(cells, task.first_bundle + bundle, receivers.normals):
-                task.stops[bundle] = inputs.spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
+                task.opaque_from[bundle] = inputs.spheres.cluster_bounds.shape[1] * NODES_PER_CLUSTER
         traverse(receivers, block.batch, inputs.spheres, Gradients(), task)
-        direction_count = task.stops.shape[0] * BUNDLE
+        direction_count = task.opaque_from.shape[0] * BUNDLE
         rows = transmittance[block.batch][block.first : block.end]
         store_columns(task.transmittances, 0, rows, task.first_bundle * BUNDLE, direction_count, block.number)
 
@@ -240,7 +242,7 @@ def _make_transmit_adjoint(has_horizon: bool, has_footprints: bool, lanes: int) 
         # in
         inputs: TraversalInputs,
         cells: DirectionCells,
-        all_stops: wp.array3d(dtype=wp.int32),
+        opaque_rows: wp.array3d(dtype=wp.int32),
         transmittance: wp.array3d(dtype=wp.float32),
         adj_transmittance: wp.array3d(dtype=wp.float32),
         # scratch
@@ -256,8 +258,8 @@ def _make_transmit_adjoint(has_horizon: bool, has_footprints: bool, lanes: int) 
         """A thread owns a block of receivers and a sector of directions."""
         i, j = wp.tid()
         sector, row = split_launch(worker, first_row + i, j)
-        block, receivers, task = load_task(row, sector, worker, inputs, cells, all_stops, scratch, reached_bundles)
-        first_direction, count = task.first_bundle * BUNDLE, task.stops.shape[0] * BUNDLE
+        block, receivers, task = load_task(row, sector, worker, inputs, cells, opaque_rows, scratch, reached_bundles)
+        first_direction, count = task.first_bundle * BUNDLE, task.opaque_from.shape[0] * BUNDLE
         rows = transmittance[block.batch][block.first : block.end]
         adj_rows = adj_transmittance[block.batch][block.first : block.end]
         load_columns(rows, first_direction, count, block.number, 0.0, task.transmittances, 0)
@@ -321,7 +323,7 @@ def transmittance(
     device, traits = points.device, (normals is not None, footprints is not None, lanes)
     sectors = sector_count(device, len(directions))
     bundle_count = len(directions) // (BUNDLE * sectors)
-    stops = empty((row_count, sectors, bundle_count), dtype=wp.int32, device=device)
+    opaque_from = empty((row_count, sectors, bundle_count), dtype=wp.int32, device=device)
     result = empty((*points.shape, len(directions)), dtype=wp.float32, device=device)
     return launch_with_adjoint(
         _make_transmit(*traits),
@@ -331,8 +333,8 @@ def transmittance(
         result=result,
         variables=[points],
         shared=nodes,
-        outputs=[stops],
-        adj_inputs=[stops, result],
+        outputs=[opaque_from],
+        adj_inputs=[opaque_from, result],
         scratch=[Scratch((bundle_count * BUNDLE,), lane_type(lanes)), Scratch((2, bundle_count), wp.int32)],
         cost=PAIR_COST * lanes * radii.shape[1] * bundle_count * BUNDLE,
     )

@@ -192,7 +192,7 @@ def make_cap_adjoint(
         for k in range(count):
             bundle = task.reached_bundles[1, k]
             direction_bundle = task.first_bundle + bundle
-            if task.stops[bundle] > sphere_view.traversal_index and reaches_bundle(
+            if task.opaque_from[bundle] > sphere_view.traversal_index and reaches_bundle(
                 cap, cells.axes[direction_bundle], cells.half_angles[direction_bundle]
             ):
                 for i in range(BUNDLE):

@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.constants import cached_by_values, constant
-from warpshadow.device.launch import differentiable, launch, varies
+from warpshadow.device.launch import any_requires_grad, differentiable, launch
 from warpshadow.device.memory import copied
 from warpshadow.device.parallel import split_row
 from warpshadow.maths.directions import CHUNK, MIN_WIDTH, brightest_chunk, cell_radius
@@ -140,7 +140,7 @@ def blend_sharp_cells(
     """
     row_count = transmittance.shape[0] * transmittance.shape[1]
     pairs, pair_shares, is_partial = _find_pairs(slots, spot_shares, transmittance.device)
-    is_copied = is_partial and varies([transmittance])
+    is_copied = is_partial and any_requires_grad([transmittance])
     blended = transmittance
     if is_copied:
         blended = copied(transmittance)
