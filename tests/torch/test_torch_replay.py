@@ -5,6 +5,7 @@ import dataclasses
 
 import pytest
 import torch
+import trimesh
 import warp as wp
 
 import warpshadow as ws
@@ -210,6 +211,19 @@ def test_calls_that_make_meshes_for_rays_stay_plain_on_a_cpu(make_renderer):
         assert renderer(geometry=renderer.placed(*poses)).isfinite().all()
     assert "and no mesh" in renderer.replays.reason
     assert wp.Mesh.__init__.__name__ == "__init__" and not wp.get_device("cpu").is_capturing
+
+
+def test_calls_with_a_lamp_that_may_be_inside_another_body_stay_plain(make_renderer):
+    """Rays to a lamp inside a body are traced, so a graph would keep to where the lamp was when it was captured."""
+    torus = trimesh.creation.torus(0.4, 0.15, 12, 8)
+    ring = ws.Body(torus, blockers=SPHERES, translation=(0, 0.5, 0))
+    lamp = ws.Body(ws.icosphere(0.1, 1), (0, 0, 0), emission=(9, 8, 7), translation=(2, 1, 0))
+    camera = ws.Camera.look_at((0, 2, 5), (0, 0.3, 0), size=(12, 12))
+    renderer = TorchRenderer(ws.Scene((lamp, ring, ws.Body(ws.plane(4, 4))), ws.synthetic_sky(), camera), graphs=True)
+    for shift in (0.0, -0.1, -0.2):
+        with torch.no_grad():
+            renderer(geometry=renderer.placed(*moved(renderer, shift)))
+    assert "takes no data from the host" in renderer.replays.reason
 
 
 def test_no_other_tensor_can_lie_where_the_last_ones_do(make_renderer):

@@ -7,7 +7,6 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.batch import common_batch, cut
-from warpshadow.device.cuda_graph import is_readable
 from warpshadow.device.tape import unrecorded
 from warpshadow.maths.directions import fibonacci
 from warpshadow.pipeline.bodies.blockers import Blockers
@@ -161,12 +160,12 @@ def _find_transmittances(
 def _find_where_enclosed(blockers: Blockers, emitter: int, body: int | None) -> np.ndarray:
     """Find the geometries with an emitter inside the bounds of a body, so that parts may be behind it, bool.
 
-    Where arrays cannot be read, the scene's own bodies tell.
+    On a GPU, which would have to wait for that, the scene's own bodies tell. A graph of a CPU is refused by the read.
     """
     if body is None:
         return np.zeros(1, bool)
     starts = blockers.merged_scene.first_vertex
-    if is_readable(blockers.positions.device):
+    if blockers.positions.device.is_cpu:
         positions = blockers.positions.numpy()
         emitter_positions, body_positions = (
             positions[:, starts[number] : starts[number + 1]] for number in (emitter, body)
