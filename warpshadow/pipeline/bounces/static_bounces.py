@@ -161,7 +161,7 @@ class StaticBounces:
         So openness and bounced light have the same noise, which cancels in their ratio, the blockers' mean radiance.
 
         Args:
-            points, materials: As above.
+            context, materials: As above.
             at_patch_samples: Node of direct shading as above; None in free light.
 
         Returns:
@@ -173,8 +173,8 @@ class StaticBounces:
         return field_of(self._factors(context, materials, senders, at_patch_samples), "openness")
 
     def _item_text(self, context: ShadingContext, senders: Senders) -> Callable[[], str]:
-        weak_points = context.weak_reference
-        return lambda: f"{receiver_text(weak_points)}, {len(senders.areas):,} patches, {self._bounces} bounces"
+        weak_context = context.weak_reference
+        return lambda: f"{receiver_text(weak_context)}, {len(senders.areas):,} patches, {self._bounces} bounces"
 
     def _factors(
         self, context: ShadingContext, materials: Materials, senders: Senders, at_patch_samples: Node | None = None

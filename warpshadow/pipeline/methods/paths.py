@@ -121,7 +121,7 @@ def path_traced(
             wp.copy(bounced[instance], light)
         return add_light(shading, bounced)
 
-    weak_points = context.weak_reference
+    weak_context = context.weak_reference
     return Node(
         "bounces",
         trace,
@@ -137,7 +137,7 @@ def path_traced(
         materials.of_vertices("emission") if materials.emission else None,
         emission_images.pyramids if emission_images and emission_images.images else None,
         emitters,
-        items=lambda: f"{receiver_text(weak_points)} × {paths:,} paths of {maximum} bounces",
+        items=lambda: f"{receiver_text(weak_context)} × {paths:,} paths of {maximum} bounces",
         has_adjoint=False,
     )
 

@@ -112,14 +112,14 @@ class RayTraced(Method):
 
     def transfer_node(self, context: ShadingContext, shell: Input | None) -> Node:
         """Transfer vectors of points to :attr:`basis`, by rays that are spread evenly."""
-        weak_points = context.weak_reference
+        weak_context = context.weak_reference
         node = Node(
             f"transfer{context.suffix}",
             self._transfer,
             self._meshes(context),
             context.receivers_node,
             self.shell if shell is None else shell,
-            items=lambda: f"{receiver_text(weak_points)} × {self.basis.size} coefficients",
+            items=lambda: f"{receiver_text(weak_context)} × {self.basis.size} coefficients",
         )
         if node.requires_grad:
             node.function = _refuse
@@ -141,13 +141,13 @@ class RayTraced(Method):
         """Node of the meshes that rays from points meet."""
 
         def meshes() -> Node:
-            weak_points = context.weak_reference
+            weak_context = context.weak_reference
             return Node(
                 f"visibility{context.suffix}",
                 self._blocker_meshes,
                 context.vertices,
                 detached(context.receivers_node),
-                items=lambda: f"{receiver_text(weak_points)} by rays",
+                items=lambda: f"{receiver_text(weak_context)} by rays",
                 why_idle="" if self.merged_scene.shadow_casters else "no body has blockers",
                 caches=False,
                 rows=(ExplainRow("static shadows", why_idle="rays treat all receivers alike"),),

@@ -73,7 +73,7 @@ class SphereMethod(VisibilitySteps[Projected, FoundVisibility]):
     def _emitter_node(
         self, name: str, find: Callable[..., Any], context: ShadingContext, materials: Materials, *others: Node | Input
     ) -> Node:
-        emitters, weak_points = self.emitters, context.weak_reference
+        emitters, weak_context = self.emitters, context.weak_reference
         portions_of = find_portions_of(context, by_body=True)
 
         def find_in_portions(
@@ -96,7 +96,7 @@ class SphereMethod(VisibilitySteps[Projected, FoundVisibility]):
             self.emitters.samples_node(context),
             self.emitters.radiance(materials),
             *others,
-            items=lambda: f"{receiver_text(weak_points)} × {emitters.samples.first[-1]} samples",
+            items=lambda: f"{receiver_text(weak_context)} × {emitters.samples.first[-1]} samples",
         )
 
     def known_shading_node(self, context: ShadingContext, light: LightInput) -> Node:

@@ -64,14 +64,14 @@ class VisibilityNode(Node):
     ):
         self.method, self._portions_of = method, find_portions_of(context)
         self._result_of, self._join = result_of, self.join if join is None else join
-        self._progress, weak_points = method.progress and light is not None, context.weak_reference
+        self._progress, weak_context = method.progress and light is not None, context.weak_reference
         suffix, planes = context.suffix if suffix is None else suffix, context.blocker_kinds.plane_bodies
-        item_text = functools.partial(receiver_text, weak_points)
+        item_text = functools.partial(receiver_text, weak_context)
         rows = {
             "visibility": ExplainRow(
                 f"visibility{suffix}",
-                lambda: method.scene_blockers.pairs_with(weak_points),
-                lambda: _why_unblocked(method, weak_points),
+                lambda: method.scene_blockers.pairs_with(weak_context),
+                lambda: _why_unblocked(method, weak_context),
             ),
             "planes": ExplainRow(
                 f"planes{suffix}",
@@ -224,7 +224,7 @@ def self_lookup_node(
 
 def _static_shadows_node(method: VisibilitySteps, context: ShadingContext, light: Input | None) -> Node:
     """Node of cached transmittance past static bodies; its value is None if there are none."""
-    static_bodies, weak_points = context.static_bodies, context.weak_reference
+    static_bodies, weak_context = context.static_bodies, context.weak_reference
     if static_bodies is None or not static_bodies.spheres[1].shape[1]:
         light_bounces = bool(method.merged_scene.scene.bounces)
         why = "light bounces: nothing of static bodies is cached" if light_bounces else "no static body has blockers"
@@ -232,7 +232,7 @@ def _static_shadows_node(method: VisibilitySteps, context: ShadingContext, light
     rows = method.cached_rows(static_bodies, light, context.blocker_kinds)
 
     def missing() -> int:
-        receivers = weak_points.receivers_node.value_if_known(weak_points.call)
+        receivers = weak_context.receivers_node.value_if_known(weak_context.call)
         return rows.missing(None if receivers is None else receivers.static_vertices)
 
     return Node(
