@@ -654,7 +654,9 @@ def test_gradients_of_a_band_are_exact(double, device, check, across):
 
     def smooth(image, clip_positions):
         fragments = double("stages.raster.rasterization").rasterize(clip_positions, faces, *SIZE)
-        silhouettes = double("stages.silhouettes.find").find_silhouettes(fragments, faces, neighbors, clip_positions)
+        silhouettes = double("stages.silhouettes.silhouettes").find_silhouettes(
+            fragments, faces, neighbors, clip_positions
+        )
         return double("stages.silhouettes.smooth").smooth_silhouettes(image, silhouettes, clip_positions)
 
     check(smooth, (wp.vec3d, random(0, 1, SIZE[1], SIZE[0], 3)), (wp.vec4d, clip_positions))

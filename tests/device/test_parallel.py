@@ -21,7 +21,7 @@ from warpshadow.stages.light.shading import shade
 from warpshadow.stages.light.transfer import directional_transfer, sh_transfer
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.rasterization import rasterize
-from warpshadow.stages.silhouettes.find import find_silhouettes
+from warpshadow.stages.silhouettes.silhouettes import find_silhouettes
 from warpshadow.stages.visibility import directional, log_sh
 from warpshadow.stages.visibility.exponential import exponentiate
 

@@ -17,10 +17,10 @@ from warpshadow.stages.raster.rasterization import Fragments, rasterize
 from warpshadow.stages.raster.sides import find_sides
 from warpshadow.stages.ray_traced.traced_transfer import trace_transfer
 from warpshadow.stages.rays.ray_tracing import trace_shading, trace_visibility
-from warpshadow.stages.receivers.find import Receivers, find_receivers
+from warpshadow.stages.receivers.receivers import Receivers, find_receivers
 from warpshadow.stages.receivers.vertex_receivers import Numbering, number_receivers, seen_vertices
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
-from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
+from warpshadow.stages.silhouettes.silhouettes import Silhouettes, find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
 from warpshadow.stages.textures.footprint import Footprints, find_footprints
 from warpshadow.stages.textures.pyramid import Textures, mip_pyramids

@@ -14,7 +14,7 @@ from warpshadow.stages.image.slopes import MIN_WEIGHT, moving_radiance
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.rasterization import rasterize
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
-from warpshadow.stages.silhouettes.find import find_silhouettes
+from warpshadow.stages.silhouettes.silhouettes import find_silhouettes
 
 # float32 kernels against float64; measured 2e-6.
 FLOAT32 = 2e-5

@@ -11,8 +11,8 @@ from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.rasterization import rasterize
-from warpshadow.stages.receivers.find import find_receivers
 from warpshadow.stages.receivers.quadtree import find_quadtree, probe_grid
+from warpshadow.stages.receivers.receivers import find_receivers
 from warpshadow.stages.receivers.vertex_receivers import number_receivers
 
 # Interpolated float32 positions of size 1.

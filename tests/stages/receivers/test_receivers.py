@@ -13,9 +13,9 @@ from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.rasterization import Fragments, rasterize
-from warpshadow.stages.receivers.find import find_receivers
+from warpshadow.stages.receivers.receivers import find_receivers
 from warpshadow.stages.receivers.vertex_receivers import number_receivers, seen_vertices
-from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
+from warpshadow.stages.silhouettes.silhouettes import Silhouettes, find_silhouettes
 
 # Interpolated float32 positions of size 1.
 FLOAT32 = 2e-6

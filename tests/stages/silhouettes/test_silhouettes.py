@@ -18,7 +18,7 @@ from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.rasterization import rasterize
 from warpshadow.stages.silhouettes import find
-from warpshadow.stages.silhouettes.find import find_silhouettes
+from warpshadow.stages.silhouettes.silhouettes import find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
 
 # float32 kernels against the float64 twin; measured 2e-6 for values and 7e-7 for gradients.

@@ -31,7 +31,7 @@ from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.rays.ray_packets import FaceTree, build_face_tree
 from warpshadow.stages.receivers.body_spans import Span
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 from warpshadow.stages.self_visibility.buried import find_buried, find_dilation
 from warpshadow.stages.self_visibility.gather import BodyTables, gather_self_transmittance
 from warpshadow.stages.self_visibility.lookup import (

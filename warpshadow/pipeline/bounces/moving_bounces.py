@@ -37,7 +37,7 @@ from warpshadow.scene.scene import Bounces
 from warpshadow.stages.bounces.patch_weights import PatchWeights, find_mean_transmittance, find_patch_weights
 from warpshadow.stages.bounces.radiosity import patch_radiosity
 from warpshadow.stages.light.sums import add_light
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 
 
 def _portion_for_bounces(method: SphereMethod, portion: LitPortion) -> PortionForBounces:

@@ -26,7 +26,7 @@ from warpshadow.stages.bounces.radiosity import mean_over_patch_samples
 from warpshadow.stages.patches import MAX_PATCHES, SAMPLES_PER_PATCH, Patches, find_patches, find_plane_patches
 from warpshadow.stages.planes.face_texels import FaceTexels, find_face_texels, no_face_texels
 from warpshadow.stages.planes.plane_blockers import PlaneBlockers, PlaneBody
-from warpshadow.stages.receivers.find import Receivers, receivers_on_faces
+from warpshadow.stages.receivers.receivers import Receivers, receivers_on_faces
 from warpshadow.stages.sparse import SparseMatrix, multiply
 from warpshadow.stages.textures.numbers import as_colors
 

@@ -20,7 +20,7 @@ from warpshadow.stages.bounces.proxies import find_depths, place_proxies
 from warpshadow.stages.bounces.proxy_radiance import patches_of_clusters
 from warpshadow.stages.bounces.tangent_planes import TangentPlanes, find_tangent_planes, find_tolerances
 from warpshadow.stages.planes.fronts import NearestBlockers, find_fronts
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 from warpshadow.stages.visibility.traversal import ClusterTree, find_clusters
 

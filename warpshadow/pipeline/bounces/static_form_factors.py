@@ -32,7 +32,7 @@ from warpshadow.stages.bounces.form_factors import (
 )
 from warpshadow.stages.bounces.irradiance_cache import choose_cache_points, interpolation_matrix
 from warpshadow.stages.rays.ray_packets import FaceTree
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from warpshadow.stages.gloss.suns import find_sun_transmittance
 from warpshadow.stages.gloss.transmittance import interpolate_transmittance, sharpen
 from warpshadow.stages.light.shading import shade
 from warpshadow.stages.light.transfer import directional_transfer
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 
 
 class CellLobes(LobeVisibility):

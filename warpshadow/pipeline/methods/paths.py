@@ -15,7 +15,7 @@ from warpshadow.pipeline.receivers.shading_context import ShadingContext, receiv
 from warpshadow.stages.light.light_samples import sample_map
 from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.ray_traced.path_tracing import PathSurfaces, trace_bounces
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 from warpshadow.stages.shell.shell_rays import FAR
 from warpshadow.stages.textures.numbers import as_colors
 from warpshadow.stages.textures.pyramid import Textures

@@ -24,7 +24,7 @@ from warpshadow.stages.ray_traced.shared_rays import find_corners, find_light_sh
 from warpshadow.stages.ray_traced.traced_transfer import trace_transfer
 from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, build_face_tree
 from warpshadow.stages.rays.ray_tracing import trace_shading
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 from warpshadow.stages.shell.shell_rays import FAR, check_within
 
 if TYPE_CHECKING:  # it is imported where bodies emit

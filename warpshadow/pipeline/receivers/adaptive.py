@@ -20,9 +20,9 @@ from warpshadow.pipeline.bodies.blockers import Blockers
 from warpshadow.pipeline.receivers.grouping import blockers_around, group_spheres
 from warpshadow.pipeline.receivers.groups import Group
 from warpshadow.pipeline.receivers.shading_context import AdaptiveSurfaces
-from warpshadow.stages.receivers.find import points_of_fragments
 from warpshadow.stages.receivers.numbering import number_items
 from warpshadow.stages.receivers.quadtree import Quadtree, find_quadtree, keys_of_probes, probe_grid
+from warpshadow.stages.receivers.receivers import points_of_fragments
 from warpshadow.stages.receivers.sample_receivers import fragments_of_samples
 
 

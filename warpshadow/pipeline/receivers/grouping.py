@@ -23,7 +23,7 @@ from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.stages.light.cached_cells import CachedRows
 from warpshadow.stages.planes.fronts import NearestBlockers
 from warpshadow.stages.receivers.body_spans import Span, relative_spans
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 from warpshadow.stages.visibility.traversal import find_clusters
 
 

@@ -16,8 +16,8 @@ from warpshadow.pipeline.bodies.reflectance import Materials
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.raster.rasterization import Fragments
-from warpshadow.stages.receivers.find import Receivers
 from warpshadow.stages.receivers.receiver_footprints import FootprintInputs
+from warpshadow.stages.receivers.receivers import Receivers
 
 if TYPE_CHECKING:
     from warpshadow.pipeline.receivers.static import StaticBodies

@@ -25,7 +25,7 @@ from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.light.cached_cells import CachedRows
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.sides import split_sides
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 
 
 class StaticBodies:

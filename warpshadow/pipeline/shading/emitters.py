@@ -41,7 +41,7 @@ from warpshadow.stages.gloss.highlights import sum_highlights
 from warpshadow.stages.gloss.reflection import LobeLight
 from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.raster.rasterization import Fragments
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 from warpshadow.stages.sparse import SparseMatrix, multiply
 
 if TYPE_CHECKING:

@@ -33,7 +33,7 @@ from warpshadow.stages.light.sums import add_light
 from warpshadow.stages.planes.face_texels import FaceTexels
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.rasterization import Fragments
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 from warpshadow.stages.receivers.sample_receivers import MAX_SHARED_SAMPLES, places_in_pixels
 from warpshadow.stages.shell.shell_rays import exits_from_shell
 from warpshadow.stages.textures.footprint import Footprints

@@ -14,7 +14,7 @@ from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.stages.gloss.reflection import number_runs
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.receivers.body_spans import Span
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 
 
 class GlossyPoints(ShadingContext):

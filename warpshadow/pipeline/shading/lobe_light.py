@@ -16,7 +16,7 @@ from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.shading.glossy_points import GlossyPoints
 from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.stages.gloss.prefilter import prefilter
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 
 _MIN_SAMPLES = 8  # of a receiver, however many receivers a pixel has: as many as a processor finds at once
 

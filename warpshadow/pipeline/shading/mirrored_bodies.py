@@ -25,7 +25,7 @@ from warpshadow.pipeline.shading.light_input import LightInput
 from warpshadow.stages.gloss.lobe_hits import HIT_TYPES, MIRRORS, REFLECTIONS, SENDS, LobeHits, hit_shapes, trace_hits
 from warpshadow.stages.gloss.mirrored import mirror, mix_mirrored
 from warpshadow.stages.planes.face_texels import FaceTexels
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 
 
 class ShownBodies(NamedTuple):

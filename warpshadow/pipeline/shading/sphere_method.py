@@ -22,7 +22,7 @@ from warpshadow.pipeline.shading.visibility_nodes import (
     self_lookup_node,
 )
 from warpshadow.pipeline.shading.visibility_steps import FoundVisibility, Projected, VisibilitySteps
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 
 
 class SphereMethod(VisibilitySteps[Projected, FoundVisibility]):

@@ -15,11 +15,11 @@ from warpshadow.pipeline.receivers.static import StaticBodies
 from warpshadow.pipeline.shading.method import Method
 from warpshadow.stages.image.outlines import find_outline_samples
 from warpshadow.stages.raster.rasterization import Fragments
-from warpshadow.stages.receivers.find import Receivers, find_receivers
 from warpshadow.stages.receivers.receiver_footprints import FootprintInputs
+from warpshadow.stages.receivers.receivers import Receivers, find_receivers
 from warpshadow.stages.receivers.sample_receivers import MAX_SHARED_SAMPLES
 from warpshadow.stages.receivers.vertex_receivers import Numbering, mark_seen_vertices, number_receivers
-from warpshadow.stages.silhouettes.find import Silhouettes
+from warpshadow.stages.silhouettes.silhouettes import Silhouettes
 
 _MIN_SHARED_SIZE = 128
 """Shorter side of a still [pixels] from which samples of different faces share a receiver. In smaller stills shadows

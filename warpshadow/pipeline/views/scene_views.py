@@ -29,7 +29,7 @@ from warpshadow.pipeline.views.view import View, ViewDependencies
 from warpshadow.pipeline.views.view_warnings import warn_of_view
 from warpshadow.stages.geometry.normals import vertex_normals
 from warpshadow.stages.raster.project import check_clip_space
-from warpshadow.stages.receivers.find import Receivers, receivers_on_faces
+from warpshadow.stages.receivers.receivers import Receivers, receivers_on_faces
 
 
 class SceneViews:

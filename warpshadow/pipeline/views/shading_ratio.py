@@ -11,7 +11,7 @@ from warpshadow.pipeline.methods.by_name import make_method
 from warpshadow.pipeline.node import Call, Input, Node
 from warpshadow.pipeline.receivers.shading_context import ShadingContext
 from warpshadow.pipeline.views.view import View
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 
 
 def shading_ratio(view: View, call: Call) -> np.ndarray:

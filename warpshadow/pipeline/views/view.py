@@ -26,8 +26,8 @@ from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.rasterization import Fragments, rasterize
 from warpshadow.stages.raster.sides import find_sides
-from warpshadow.stages.receivers.find import Receivers
-from warpshadow.stages.silhouettes.find import Silhouettes, find_silhouettes
+from warpshadow.stages.receivers.receivers import Receivers
+from warpshadow.stages.silhouettes.silhouettes import Silhouettes, find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
 from warpshadow.stages.textures.footprint import Footprints
 from warpshadow.stages.textures.sample import sample_albedo, textured_radiance

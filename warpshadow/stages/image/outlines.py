@@ -16,8 +16,8 @@ from warpshadow.device.memory import copied, reshaped, zeros
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.screen import ends_before, half_size, has_neighbor, line_distance, neighbor
 from warpshadow.stages.receivers.quadtree import Quadtree
-from warpshadow.stages.silhouettes.find import Silhouettes
 from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, line_between, make_fragment_arrays
+from warpshadow.stages.silhouettes.silhouettes import Silhouettes
 
 MIN_DISTANCE = 0.02  # distance of an edge [samples] below which rounding outweighs how color changes on the way to it
 
@@ -129,7 +129,7 @@ def find_outline_samples(
     """Find the samples that follow their surface by mean slopes although they are receivers.
 
     Args:
-        silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`.
+        silhouettes: Of :func:`warpshadow.stages.silhouettes.silhouettes.find_silhouettes`.
         clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex].
         quadtree: Squares in which samples interpolate, which none of these does; None for none.
     Returns:

@@ -58,8 +58,8 @@ from warpshadow.stages.raster.screen import (
 )
 from warpshadow.stages.silhouettes.areas import LineArea
 from warpshadow.stages.silhouettes.edge_colors import find_edge_colors
-from warpshadow.stages.silhouettes.find import Silhouettes
 from warpshadow.stages.silhouettes.lines import FragmentArrays, edge_position_adjoint
+from warpshadow.stages.silhouettes.silhouettes import Silhouettes
 from warpshadow.stages.silhouettes.smooth import find_image_weight
 
 MIN_WEIGHT = 0.25  # of a sample in the smoothed image, by which its slopes are divided
@@ -278,7 +278,7 @@ def moving_radiance(
         faces: Indices of receivers, vec3i of shape [face].
         shading: Of the receivers, vec3 of shape [batch, receiver].
         albedo: Of the samples, vec3 of shape [batch, height, width].
-        silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`.
+        silhouettes: Of :func:`warpshadow.stages.silhouettes.silhouettes.find_silhouettes`.
         clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex].
         receivers: As for :func:`warpshadow.stages.silhouettes.edge_colors.find_edge_colors`.
         has_mean_slope: Of :func:`find_outline_samples`, if the receivers were found with it.

@@ -28,7 +28,7 @@ from warpshadow.stages.light.light_samples import LightSamples
 from warpshadow.stages.rays.beam_packets import make_beams
 from warpshadow.stages.rays.ray_packets import PACKET, FaceTree, make_find_open, packets_of
 from warpshadow.stages.rays.ray_tracing import progress_slices
-from warpshadow.stages.receivers.find import Receivers
+from warpshadow.stages.receivers.receivers import Receivers
 from warpshadow.stages.receivers.sample_receivers import MAX_SHARED_SLOPE, MIN_SHARED_COSINE
 from warpshadow.stages.shell.shell_rays import FAR
 

@@ -14,7 +14,7 @@ from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.sides import split_side
 from warpshadow.stages.receivers.body_spans import Span, spans_of
 from warpshadow.stages.receivers.numbering import number_items
-from warpshadow.stages.silhouettes.find import Silhouettes
+from warpshadow.stages.silhouettes.silhouettes import Silhouettes
 
 _MARK_COST = 5.0  # nanoseconds that a sample takes, to mark the corners of its face
 
@@ -153,8 +153,8 @@ def mark_seen_vertices(fragments: Fragments, silhouettes: Silhouettes, vertex_co
 
     Args:
         fragments: The fragments, of any number of instances.
-        silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`, whose edges have colors of their
-            own.
+        silhouettes: Of :func:`warpshadow.stages.silhouettes.silhouettes.find_silhouettes`, whose edges have colors of
+            their own.
         vertex_count: Number of vertices.
     Returns:
         bool of shape [1, vertex], or [2, vertex] where fragments have sides: the union over all instances, so that all

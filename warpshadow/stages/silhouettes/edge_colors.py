@@ -16,8 +16,8 @@ from warpshadow.stages.raster.screen import (
     sample_center,
 )
 from warpshadow.stages.raster.sides import join_side, split_side
-from warpshadow.stages.silhouettes.find import Silhouettes
 from warpshadow.stages.silhouettes.lines import NOTHING, FragmentArrays, image_index, line_between, make_fragment_arrays
+from warpshadow.stages.silhouettes.silhouettes import Silhouettes
 
 wp.set_module_options({"max_unroll": 1})  # loops that are not unrolled compile faster, and run as fast
 

@@ -3,7 +3,7 @@
 A rasterized image jumps at a silhouette, and does not change while the line between two samples moves. So each takes of
 the other's color as much as its own area beyond the line (:mod:`warpshadow.stages.silhouettes.areas`; after Laine et
 al. 2020, section 3.5, who take edges as upright). A sample of color c, with neighbors of colors c_k, areas e_k beyond
-the lines and weights ω_k of the lines (:mod:`warpshadow.stages.silhouettes.find`), becomes
+the lines and weights ω_k of the lines (:mod:`warpshadow.stages.silhouettes.silhouettes`), becomes
 
     c + Σ_k e_k (ω_k − Σ_l π_kl max(ω_k + ω_l − 1, 0) e_l) (c_k − c)          l: the two directions across k
 
@@ -24,8 +24,8 @@ from warpshadow.device.warp_internals import scalar_type
 from warpshadow.stages.raster.interpolation import inner_product
 from warpshadow.stages.raster.screen import neighbor, opposite
 from warpshadow.stages.silhouettes.areas import LineArea, measure_area_adjoint
-from warpshadow.stages.silhouettes.find import Silhouettes
 from warpshadow.stages.silhouettes.lines import INTERSECTION, FragmentArrays, make_fragment_arrays
+from warpshadow.stages.silhouettes.silhouettes import Silhouettes
 
 
 @wp.func
@@ -153,8 +153,8 @@ def smooth_silhouettes(
     Args:
         image: float32 or a vector of them, shape [batch, height, width]; of ones where there is a face and zeros
             elsewhere it becomes the coverage.
-        silhouettes: Of :func:`warpshadow.stages.silhouettes.find.find_silhouettes`; if their batch is 1 they serve
-            every image.
+        silhouettes: Of :func:`warpshadow.stages.silhouettes.silhouettes.find_silhouettes`; if their batch is 1 they
+            serve every image.
         clip_positions: The vertices that the silhouettes were found for, vec4 of shape [batch, vertex]; they are moved.
         edge_colors: Of :func:`warpshadow.stages.silhouettes.edge_colors.find_edge_colors`, by which gradients of edges
             go; by default the colors of samples.
