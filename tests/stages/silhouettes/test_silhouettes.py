@@ -17,8 +17,7 @@ from warpshadow.maths.adjacency import edge_neighbors
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.rasterization import rasterize
-from warpshadow.stages.silhouettes import find
-from warpshadow.stages.silhouettes.silhouettes import find_silhouettes
+from warpshadow.stages.silhouettes.silhouettes import MAX_SAMPLES, find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
 
 # float32 kernels against the float64 twin; measured 2e-6 for values and 7e-7 for gradients.
@@ -456,9 +455,9 @@ def test_more_samples_than_int32_counts_are_refused(device, monkeypatch):
 
 
 def test_as_many_samples_are_accepted_as_strides_of_int32_reach():
-    check_strides((4, find.MAX_SAMPLES), wp.int32)
+    check_strides((4, MAX_SAMPLES), wp.int32)
     with pytest.raises(MemoryError):
-        check_strides((4, find.MAX_SAMPLES + 1), wp.int32)
+        check_strides((4, MAX_SAMPLES + 1), wp.int32)
 
 
 def test_several_threads_that_follow_an_edge_find_the_same(device, monkeypatch):
