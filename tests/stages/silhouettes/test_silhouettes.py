@@ -17,6 +17,7 @@ from warpshadow.maths.adjacency import edge_neighbors
 from warpshadow.stages.raster.interpolation import interpolate
 from warpshadow.stages.raster.project import to_clip
 from warpshadow.stages.raster.rasterization import rasterize
+from warpshadow.stages.silhouettes import silhouettes as silhouettes_file
 from warpshadow.stages.silhouettes.silhouettes import MAX_SAMPLES, find_silhouettes
 from warpshadow.stages.silhouettes.smooth import smooth_silhouettes
 
@@ -448,7 +449,7 @@ def test_without_reading_the_count_back_the_result_is_the_same(device, monkeypat
 
 
 def test_more_samples_than_int32_counts_are_refused(device, monkeypatch):
-    monkeypatch.setattr(find, "MAX_SAMPLES", 81 * 97 - 1)
+    monkeypatch.setattr(silhouettes_file, "MAX_SAMPLES", 81 * 97 - 1)
     mesh = ws.icosphere(1.0, 1)
     with pytest.raises(ValueError, match="fragments: got 7857 samples in all, expected at most 7856"):
         setup(mesh.positions, mesh.faces, device)
@@ -463,7 +464,7 @@ def test_as_many_samples_are_accepted_as_strides_of_int32_reach():
 def test_several_threads_that_follow_an_edge_find_the_same(device, monkeypatch):
     mesh = ws.icosphere(1.0, 1)
     expected = lines(setup(mesh.positions, mesh.faces, device))
-    monkeypatch.setattr(find, "strip_count", lambda device: 7)
+    monkeypatch.setattr(silhouettes_file, "strip_count", lambda device: 7)
     assert lines(setup(mesh.positions, mesh.faces, device)) == expected
 
 
