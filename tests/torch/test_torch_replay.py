@@ -213,6 +213,43 @@ def test_calls_that_make_meshes_for_rays_stay_plain_on_a_cpu(make_renderer):
     assert wp.Mesh.__init__.__name__ == "__init__" and not wp.get_device("cpu").is_capturing
 
 
+def test_replays_refuse_what_plain_calls_refuse_and_go_on_after_it(make_renderer):
+    renderer, plain = (make_renderer(graphs=graphs) for graphs in (True, False))
+
+    def image(item, shift, **given):
+        return item(geometry=item.placed(*moved(item, shift)), **given)
+
+    albedo, light = torch.full((3,), 0.5), torch.ones(renderer.basis.size, 3)
+    for shift in (0.1, 0.2, 0.3):
+        image(renderer, shift, albedo={"icosphere": albedo}, light=light)
+    assert not renderer.replays.reason
+    earlier = image(renderer, 0.1, albedo={"icosphere": albedo}, light=light.requires_grad_())
+    for given, message in (
+        ({"albedo": {"icosphere": 400 * albedo}, "light": light.detach()}, r"albedo\[0\]"),
+        ({"albedo": {"icosphere": albedo}, "light": 1e30 * light.detach()}, "light"),
+    ):
+        for item in (renderer, plain):
+            with pytest.raises(ValueError, match=message):
+                image(item, 0.2, **given)
+    expected = image(plain, 0.1, albedo={"icosphere": albedo}, light=light)
+    gradients = [torch.autograd.grad(found.square().sum(), light)[0] for found in (earlier, expected)]
+    torch.testing.assert_close(*gradients, **SAME)
+
+
+def test_tensors_of_inference_mode_are_replayed(make_renderer):
+    renderer, plain = (make_renderer(graphs=graphs) for graphs in (True, False))
+    with torch.inference_mode():
+        for shift in (0.1, 0.2, 0.3, 0.4):
+            images = [item(geometry=item.placed(*inference_poses(item, shift))) for item in (renderer, plain)]
+            torch.testing.assert_close(*images, **SAME)
+    assert not renderer.replays.reason
+
+
+def inference_poses(renderer: TorchRenderer, shift: float) -> tuple[torch.Tensor, ...]:
+    rotations, translations, scales = renderer.scene_poses()
+    return rotations, translations + shift, scales
+
+
 def test_calls_with_a_lamp_that_may_be_inside_another_body_stay_plain(make_renderer):
     """Rays to a lamp inside a body are traced, so a graph would keep to where the lamp was when it was captured."""
     torus = trimesh.creation.torus(0.4, 0.15, 12, 8)

@@ -6,8 +6,10 @@ is checked.
 """
 
 import contextlib
+import functools
 import threading
-from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -129,6 +131,30 @@ def late_checks() -> contextlib.AbstractContextManager[None]:
     return _late_checks
 
 
+_postponed: tuple[list[tuple[int, int]], list[Callable[[], None]]] | None = None  # memory of arguments, and checks
+
+
+@contextlib.contextmanager
+def postponed_checks(arguments: Sequence[wp.array]) -> Iterator[list[Callable[[], None]]]:
+    """Collect the checks of the arguments of a call while a graph of it is captured, due before each replay."""
+    global _postponed
+    before, checks = _postponed, list[Callable[[], None]]()
+    _postponed = [(array.ptr, array.ptr + array.capacity) for array in arguments if array.size], checks
+    try:
+        yield checks
+    finally:
+        _postponed = before
+
+
+def postpone(array: wp.array, check_array: Callable[[], None]) -> bool:
+    """Whether an array cannot be read since a graph is captured: the check is then collected, if one of arguments."""
+    if not array.device.is_capturing:
+        return False
+    if _postponed is not None and any(first <= array.ptr < end for first, end in _postponed[0]):
+        _postponed[1].append(check_array)
+    return True
+
+
 def _is_awaited(device: wp.Device) -> bool:
     """Whether the host waits where it reads a device's arrays."""
     return device.is_cuda
@@ -143,8 +169,8 @@ def finite_arrays(
 ) -> None:
     """Raise ValueError when float32 arrays on a device, of any dtype, hold NaN, Inf or numbers out of range.
 
-    On a GPU that is found when the call ends (:func:`late_checks`), at once where there is none. While a CUDA graph is
-    captured nothing can be read back, and nothing is checked.
+    On a GPU that is found when the call ends (:func:`late_checks`), at once where there is none. While a graph is
+    captured nothing can be read back, and nothing is checked, or before its replays (:func:`postponed_checks`).
 
     Args:
         arrays: By the names of their arguments; None is passed over.
@@ -154,7 +180,12 @@ def finite_arrays(
     """
     present = {name: array for name, array in arrays.items() if array is not None and array.size}
     devices = [array.device for array in present.values()]
-    if not devices or any(device.is_capturing for device in devices):
+    if not devices:
+        return
+    if any(device.is_capturing for device in devices):
+        options: dict[str, Any] = {"minimum": minimum, "maximum": maximum, "nonnegative": nonnegative}
+        for name, array in present.items():
+            postpone(array, functools.partial(finite_arrays, {name: array}, **options))
         return
     smallest = -maximum if minimum is None else minimum
     ranges = {name: (0.0 if name in nonnegative else smallest, maximum) for name in present}
@@ -172,9 +203,9 @@ def finite_arrays(
 def look_at_values(array: wp.array, judge: Callable[[np.ndarray], None]) -> None:
     """Let a function look at an array's values and raise an error: on a GPU when the call ends, as finite_arrays does.
 
-    While a CUDA graph is captured it does not.
+    While a graph is captured it does not, or before its replays (:func:`postponed_checks`).
     """
-    if array.device.is_capturing:
+    if postpone(array, functools.partial(look_at_values, array, judge)):
         return
     if not _is_awaited(array.device):
         judge(array.numpy())

@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 import torch
 import warp as wp
 
+from warpshadow.device.array_checks import postponed_checks
 from warpshadow.device.capacities import Capacities
 from warpshadow.device.constants import collecting_constants
 from warpshadow.device.cuda_graph import capture
@@ -106,7 +107,7 @@ class _CallHistory:
         self._capture: Capture | None = None
         self._failure = ""
         self._unchanged: list[torch.Tensor] = []  # of the last call: held, so that no other lies where they did
-        self._versions: list[tuple[int, int]] | None = None  # of these
+        self._versions: list[tuple[int, object]] | None = None  # of these
 
     def replay(
         self,
@@ -116,7 +117,7 @@ class _CallHistory:
         unchanged: Sequence[torch.Tensor],
     ) -> tuple[CallResults | None, str]:
         """The results of a replay, or why there are none."""
-        before, self._versions = self._versions, [(tensor.data_ptr(), tensor._version) for tensor in unchanged]
+        before, self._versions = self._versions, [_version_of(tensor) for tensor in unchanged]
         self._unchanged = [tensor.detach() for tensor in unchanged]
         if unchanged and self._versions == before:
             return None, "geometry or cameras are the same as before: results about them are cached"
@@ -173,7 +174,7 @@ class Capture:
             raise RuntimeError(f"{warp_device} has no memory pool (wp.set_mempool_enabled)")
         with current_stream(function.device), capacities.used():
             plain_results, self.plain_seconds = self._timed(lambda: self._copies(function.record(*no_gradients)[1]))
-        with collecting_constants() as self._cached_values:
+        with collecting_constants() as self._cached_values, postponed_checks(self._arguments) as self._checks:
             with capture(warp_device) as captured, capacities.used():
                 self._tape, self._results = function.record(self._arguments, requires_grad)  # zeroes gradients, too
             self._forward = captured.graph
@@ -218,9 +219,11 @@ class Capture:
         return CallResults(results, [result.requires_grad for result in self._results], playback)
 
     def _launch_forward(self, tensors: Sequence[torch.Tensor]) -> None:
+        self._state += 1
         for unchanged, tensor in zip(self._inputs, tensors, strict=True):
             unchanged.copy_(tensor.detach())
-        self._state += 1
+        for check_argument in self._checks:
+            check_argument()
         with current_stream(self._device):
             wp.capture_launch(self._forward)
 
@@ -238,6 +241,11 @@ class Capture:
             return tuple(
                 tensor_of(argument.grad).clone() if argument.requires_grad else None for argument in self._arguments
             )
+
+
+def _version_of(tensor: torch.Tensor) -> tuple[int, object]:
+    """Where a tensor is, and how often it was written to; torch counts no writes in ``inference_mode``."""
+    return tensor.data_ptr(), object() if tensor.is_inference() else tensor._version
 
 
 def _agree(result: torch.Tensor, other: torch.Tensor) -> bool:

@@ -1,6 +1,7 @@
 """Materials of bodies; the colors of the samples of a view, from albedo of bodies and vertices and from textures."""
 
 import copy
+import functools
 import operator
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -9,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow import check
-from warpshadow.device.array_checks import finite_arrays
+from warpshadow.device.array_checks import finite_arrays, postpone
 from warpshadow.device.batch import concatenate
 from warpshadow.device.constants import constant, gather_of_owners
 from warpshadow.device.cuda_graph import is_readable
@@ -230,6 +231,8 @@ class Materials:
 
     def _check_colors(self, name: str, values: wp.array) -> None:
         """Refuse codes of a picture, and warn where light would grow, if the host need not wait for the values."""
+        if postpone(values, functools.partial(self._check_colors, name, values)):
+            return
         colors = values.numpy() if is_readable(values.device) else np.zeros(0)
         largest = colors.max(initial=0.0)
         if largest > _MIN_CODE and colors.mean() > _MIN_CODE:
