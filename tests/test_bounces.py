@@ -564,7 +564,7 @@ def test_a_geometry_given_again_is_not_seen_again_where_light_bounces(method, na
         raise AssertionError("it is seen again")
 
     with monkeypatch.context() as patch:
-        for function in ("find_visibility", "find_visibility_past_planes", "transfer", "self_lookups"):
+        for function in ("find_visibility", "find_visibility_past_planes", "find_transfer", "self_lookups"):
             patch.setattr(type(renderer.array_renderer._method), function, refuse)
         patch.setattr(moving_bounces, "find_cell_transmittance", refuse)
         patch.setattr(patches, "receivers_on_faces", refuse)

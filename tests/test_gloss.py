@@ -469,8 +469,8 @@ def test_gradients_to_the_color_of_a_body_that_a_metal_mirrors_agree_with_differ
     assert gradient == pytest.approx(difference, rel=SMOOTH)
 
 
-def test_lobes_are_traced_where_metals_mirror_bodies():
-    """One convex metal alone mirrors none; nor do plastics."""
+def test_lobes_are_traced_where_metals_and_smooth_bodies_mirror_bodies():
+    """One convex metal alone mirrors none; nor do rough plastics."""
     torus = trimesh.creation.torus(0.4, 0.15)
     ring = dataclasses.replace(METALS[0], mesh=ws.Mesh(torus.vertices, torus.faces), blockers=16)
     plastic = dataclasses.replace(METALS[1], metallic=0.0)
@@ -480,7 +480,8 @@ def test_lobes_are_traced_where_metals_mirror_bodies():
         ((ring,), True),
         ((*METALS, GROUND), True),
         ((METALS[0], plastic, GROUND), True),
-        ((dataclasses.replace(ring, metallic=0.0), plastic, GROUND), False),
+        ((dataclasses.replace(ring, metallic=0.0, roughness=0.4), GROUND), False),
+        ((dataclasses.replace(ring, metallic=0.0, roughness=0.2), GROUND), True),
     ):
         renderer = ws.Renderer(metal_scene(*bodies))
         assert ("hits of lobes" in str(renderer.explain())) == traces

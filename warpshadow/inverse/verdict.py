@@ -123,12 +123,13 @@ def image_error(model: Model, images: torch.Tensor) -> float:
     """Root mean square of the differences from the targets, as a part of that of the targets.
 
     Pixels count as in the end of the fit: by their masks, and less where a robust loss takes them for an occluder's.
+    Of black targets it is the root mean square itself.
     """
     weight = model.pixel_weights(images)[..., None]
     targets = model.targets[..., :3]
     differences = clip_saturated(images, model.targets, model.saturated)[..., :3] - targets
     squares, unit = ((weight * item.square()).sum() for item in (differences, targets))
-    return math.sqrt(float(squares / unit.clamp_min(1e-30)))
+    return math.sqrt(float(squares / torch.where(unit > 0, unit, weight.sum())))
 
 
 def explained_shares(model: Model, values: Mapping[str, Values], images: torch.Tensor) -> dict[int, float]:
