@@ -27,6 +27,8 @@ from warpshadow.stages.cell_neighbors import KERNEL_RADIUS, near_chunks, texel_o
 
 _COST, _SHARPENING_COST = 30.0, 2.0  # nanoseconds that a sample takes
 
+_OPEN = 1.0 - 1.0e-6  # transmittance from which on a sharpened sample counts as open, and has no gradient
+
 _MIN_KERNEL = 1.0e-10  # ε: of cells that are further away, where none is near
 _MIN_HORIZON_WEIGHT = 1.0e-7
 
@@ -126,7 +128,10 @@ def _interpolate_cells_adjoint(
     adj_normals: wp.array2d(dtype=wp.vec3),
     adj_directions: wp.array3d(dtype=wp.vec3),
 ):
-    """A thread owns a receiver. With T = t / h:  t̄ = T̄ / h,  h̄ = −T t̄, and from them k̄ and the cells' gradients."""
+    """A thread owns a receiver. With T = t / h:  t̄ = T̄ / h,  h̄ = −T t̄, and from them k̄ and the cells' gradients.
+
+    Sharpened samples that are wholly open or blocked have T̄ = 0, and are passed over.
+    """
     item = first_row + wp.tid()
     batch, receiver = split_row(item, means.shape[1])
     normal = normals[batch, receiver]
@@ -142,6 +147,8 @@ def _interpolate_cells_adjoint(
         adj_capped_cells[chunk] = Chunk(0.0)
         adj_horizon_cells[chunk] = Chunk(0.0)
     for i in range(means.shape[2]):
+        if adj_means[batch, receiver, i] == 0.0:
+            continue
         direction = directions[batch, receiver, i]
         texel = texel_of(direction)
         adj_capped = adj_means[batch, receiver, i] / weights[batch, receiver, i]
@@ -256,11 +263,12 @@ def _sharpen(
     # out
     sharp: wp.array3d(dtype=wp.float32),
 ):
-    """A thread owns a sample."""
-    row, sample = wp.tid()
-    batch, receiver = split_row(first_row + row, sharp.shape[1])
-    t = transmittance[batch, receiver, sample]
-    sharp[batch, receiver, sample] = t * t * (3.0 - 2.0 * t)
+    """A thread owns a receiver."""
+    batch, receiver = split_row(first_row + wp.tid(), sharp.shape[1])
+    for i in range(sharp.shape[2]):
+        between_cells = transmittance[batch, receiver, i]
+        t = wp.where(between_cells > _OPEN, 1.0, between_cells)
+        sharp[batch, receiver, i] = t * t * (3.0 - 2.0 * t)
 
 
 def sharpen(transmittance: wp.array) -> wp.array:
@@ -273,6 +281,6 @@ def sharpen(transmittance: wp.array) -> wp.array:
     """
     count, receiver_count, sample_count = transmittance.shape
     sharp = wp.empty(transmittance.shape, dtype=wp.float32, device=transmittance.device)
-    rows = count * receiver_count, sample_count
-    launch(_sharpen, rows, inputs=[transmittance], outputs=[sharp], cost=_SHARPENING_COST * sample_count)
+    rows, cost = count * receiver_count, _SHARPENING_COST * sample_count
+    launch(_sharpen, rows, inputs=[transmittance], outputs=[sharp], cost=cost)
     return sharp
