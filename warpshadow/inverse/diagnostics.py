@@ -136,8 +136,8 @@ def _warn_of_error(verdict: Verdict, is_falling: bool) -> None:
         reason = "light, reflectance, shapes or the camera may not be those of the targets"
         if verdict.shown:
             reason = (
-                'a pose may be in another minimum, which stages = "unknown-pose" leaves, or stands_on = "…" excludes; '
-                f"or {reason}"
+                'a pose may be in another minimum: stages = "unknown-pose" searches all, and stands_on = "…", if it is '
+                f"not set, leaves fewer; or {reason}"
             )
         if is_falling:
             reason = "the loss was still falling: give the last stage more iterations"

@@ -67,7 +67,7 @@ class MirroredBodies:
             if all(textures.sizes[number] is None for textures in materials.textures_of.values())
             and (is_glossy.sum() > 1 or not bodies[number].mesh.is_convex)
         )
-        is_smooth = any(np.min(bodies[number].roughness) <= SMOOTH for number in np.flatnonzero(is_glossy).tolist())
+        is_smooth = any(body.roughness is not None and np.min(body.roughness) <= SMOOTH for body in bodies)
         nonmetals = set(range(len(bodies))) - {*metals} if (metals or is_smooth) and have_radiosity else set()
         return ShownBodies(mirrors, tuple(sorted(nonmetals)))
 

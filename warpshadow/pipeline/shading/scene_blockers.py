@@ -1,11 +1,14 @@
 """The blockers of a scene: which bodies are planes, or convex parts, or have traced self-visibility, and the rest."""
 
 import functools
+import weakref
 from collections.abc import Iterable
 
 import numpy as np
 import warp as wp
 
+from warpshadow.assets.mesh import Mesh
+from warpshadow.device.progress import remark
 from warpshadow.maths.convex import is_panel
 from warpshadow.pipeline.bodies.blockers import ONLY_SPHERES, BlockerKinds, Blockers
 from warpshadow.pipeline.bodies.convex import SceneConvexParts
@@ -22,6 +25,8 @@ _COSTLY_EDGES = 400
 """Edges of a body's convex parts above which images take twice as long as past spheres, or longer: of sheets with 449
 and 475 edges 130 and 151 ms, past 256 spheres 59 and 63, of a vase with 1544 200 and 58, of a bowl with 1684 209 and
 60. They are 3.1, 3.2, 3.5 and 4.0% off, past spheres 6.3, 6.2, 4.3 and 7.8% (256² pixels, a thread of an EPYC)."""
+
+_remarked: weakref.WeakSet[Mesh] = weakref.WeakSet()  # meshes whose costs were said
 
 
 class SceneBlockers:
@@ -50,6 +55,7 @@ class SceneBlockers:
     ):
         self._merged_scene, self.plane_bodies = merged_scene, plane_bodies
         self._has_convex_parts, self._traces_self_visibility = has_convex_parts, traces_self_visibility
+        self._progress = progress
         self.scene_planes, self.scene_parts = ScenePlanes(merged_scene), SceneConvexParts(merged_scene)
         self.self_visibility = SelfVisibility(
             merged_scene, SceneReceivers(merged_scene).at_samples(), progress=progress
@@ -71,10 +77,22 @@ class SceneBlockers:
         why = tuple(self.self_visibility.why_spheres(body, geometry) for body in range(len(scene.bodies)))
         rigid = tuple(body for body, reason in enumerate(why) if not reason)
         convex = tuple(body for body in rigid if body in self.scene_parts.parts) if self._has_convex_parts else ()
+        self._remark_on_costs(convex)
         solids = tuple(body for body in convex if body in self.scene_parts.solids)
         traced = tuple(body for body in rigid if body not in solids)
         bulging_bodies = tuple(body for body, reason in enumerate(why) if reason and self._can_bulge[body])
         return BlockerKinds(traced, rotations, why, plane_bodies, convex, solids, bulging_bodies)
+
+    def _is_costly(self, body: int) -> bool:
+        return sum(len(part.edges) for part in self.scene_parts.parts[body]) > _COSTLY_EDGES
+
+    def _remark_on_costs(self, convex: tuple[int, ...]) -> None:
+        """Say once of each mesh that its convex parts take longer than spheres."""
+        for body in (self._merged_scene.scene.bodies[number] for number in convex if self._is_costly(number)):
+            if body.mesh not in _remarked:
+                _remarked.add(body.mesh)
+                words = "blocks light by its convex parts: nearer to its shape than spheres, in twice the time or more"
+                remark(f"{body.name!r} {words}; blockers = 256 takes spheres", shows=self._progress)
 
     @functools.cached_property
     def _can_bulge(self) -> list[bool]:
@@ -153,7 +171,7 @@ class SceneBlockers:
             return "as a part of a plane: it is flat"
         convex_parts = self.scene_parts.parts[body] if body in kinds.convex else []
         parts = f"as {len(convex_parts)} convex part{'s' * (len(convex_parts) != 1)}"
-        is_costly = sum(len(part.edges) for part in convex_parts) > _COSTLY_EDGES
+        is_costly = bool(convex_parts) and self._is_costly(body)
         costs = "; spheres, blockers = 256, take half of the time or less, and are up to twice as far off" * is_costly
         if body in kinds.solids:
             return f"{parts}, its own, too: it consists of them{costs}"
