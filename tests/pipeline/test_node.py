@@ -185,7 +185,7 @@ def wired(vertices=2, cameras=3, **options):
     clip = Node("clip positions", lambda a, b: 1, vertices, cameras, items="4 vertices")
     silhouettes = Node("silhouettes", lambda clip: clip, clip, has_adjoint=False)
     normals = Node("normals", lambda a: 1, vertices)
-    sides = Node("sides", lambda clip: clip, clip, idle="every body is closed")
+    sides = Node("sides", lambda clip: clip, clip, why_idle="every body is closed")
     image = Node("image", lambda *given: sum(given), sides, detached(silhouettes), normals, caches=False)
     return image, {node.row.name: node for node in (clip, silhouettes, normals, sides, image)}
 
@@ -267,5 +267,5 @@ def test_parts_of_a_stage_and_of_its_adjoint_are_timed_together(clock, monkeypat
 
 
 def test_what_is_idle_takes_no_time(clock):
-    node = Node("sides", lambda: 1, idle="every body is closed")
+    node = Node("sides", lambda: 1, why_idle="every body is closed")
     assert node.value(Call(clock)) == 1 and not clock.timings

@@ -1,6 +1,7 @@
 """Cells that planes cover in part, by where their light is: against coverage of each direction alone, and rays."""
 
 import gc
+import weakref
 
 import numpy as np
 import pytest
@@ -62,13 +63,12 @@ def test_directions_of_a_cell_are_eight(device):
 
 
 def test_arrays_of_planes_go_with_them(device):
+    planes = Setting(device).planes
+    arrays, weak_planes = cells.plane_arrays(planes, 0.1, None), weakref.ref(planes)
+    assert cells.plane_arrays(planes, 0.1, None) is arrays
+    del planes, arrays
     gc.collect()
-    count, planes = len(cells._ARRAYS), Setting(device).planes
-    assert cells.plane_arrays(planes, 0.1, None) is cells.plane_arrays(planes, 0.1, None)
-    assert len(cells._ARRAYS) == count + 1
-    del planes
-    gc.collect()
-    assert len(cells._ARRAYS) == count
+    assert weak_planes() is None
 
 
 def behind_a_window(**visibility):
