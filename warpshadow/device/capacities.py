@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty
+from warpshadow.device.memory import empty, from_numpy
 
 _AT_ONCE = 64  # numbers that a launch has as arguments
 _Numbers = wp.types.vector(length=_AT_ONCE, dtype=wp.int32)
@@ -122,7 +122,9 @@ def _vector_of(numbers: np.ndarray) -> _Numbers:
 
 
 def write_numbers(numbers: np.ndarray, device: wp.Device) -> wp.array:
-    """Copy numbers to a device as arguments of launches, as a graph does whose memory the host may not write to."""
+    """Copy int32 numbers to a device; in a graph, to whose memory the host may not write, as arguments of launches."""
+    if not device.is_capturing:
+        return from_numpy(numbers, dtype=wp.int32, device=device)
     result = empty(len(numbers), dtype=wp.int32, device=device)
     for first in range(0, len(numbers), _AT_ONCE):
         part = numbers[first : first + _AT_ONCE]

@@ -74,7 +74,10 @@ def capture(device: wp.Device) -> Iterator[wp.ScopedCapture]:
     """Capture the launches made within; its ``graph`` has them then.
 
     Reading an array, and making or refitting a mesh, raise RuntimeError on a CPU, too: its graphs do not record them.
+    So does a GPU without the stream-ordered allocator.
     """
+    if device.is_cuda and not wp.is_mempool_enabled(device):
+        raise RuntimeError(f"{device}: a capture that allocates needs wp.set_mempool_enabled")
     with (
         wp.ScopedCapture(device=device) as captured,
         refusing_unrecorded() if device.is_cpu else contextlib.nullcontext(),
@@ -127,8 +130,6 @@ class Captured(Generic[Result]):
 
     def _capture(self) -> tuple[wp.Graph, Result, list[Any]]:
         """The graph, the result that it writes, and the constants and cached values that it reads."""
-        if self._device.is_cuda and not wp.is_mempool_enabled(self._device):
-            raise RuntimeError(f"{self._device}: a capture that allocates needs wp.set_mempool_enabled")
         with collecting_constants() as cached_values, capture(self._device) as captured, self._capacities.used():
             result = self._function()
         return captured.graph, result, cached_values

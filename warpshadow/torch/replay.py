@@ -170,8 +170,6 @@ class Capture:
         self._backward: wp.Graph | None = None
         warp_device = wp.device_from_torch(function.device)
         no_gradients = self._arguments, [False] * len(self._arguments)
-        if warp_device.is_cuda and not wp.is_mempool_enabled(warp_device):
-            raise RuntimeError(f"{warp_device} has no memory pool (wp.set_mempool_enabled)")
         with current_stream(function.device), capacities.used():
             plain_results, self.plain_seconds = self._timed(lambda: self._copies(function.record(*no_gradients)[1]))
         with collecting_constants() as self._cached_values, postponed_checks(self._arguments) as self._checks:

@@ -50,6 +50,12 @@ class MirroredBodies:
         self._merged_scene = merged_scene
         self._mesh: wp.Mesh | None = None
 
+    @functools.cached_property
+    def _has_smooth(self) -> bool:
+        """Whether the scene has a smooth body, metal or not."""
+        roughness = (body.roughness for body in self._merged_scene.scene.bodies)
+        return any(values is not None and np.min(values) <= SMOOTH for values in roughness)
+
     def shown(self, materials: Materials, *, have_radiosity: bool) -> ShownBodies:
         """Find the bodies whose own light counts where lobes meet them.
 
@@ -67,8 +73,7 @@ class MirroredBodies:
             if all(textures.sizes[number] is None for textures in materials.textures_of.values())
             and (is_glossy.sum() > 1 or not bodies[number].mesh.is_convex)
         )
-        is_smooth = any(body.roughness is not None and np.min(body.roughness) <= SMOOTH for body in bodies)
-        nonmetals = set(range(len(bodies))) - {*metals} if (metals or is_smooth) and have_radiosity else set()
+        nonmetals = set(range(len(bodies))) - {*metals} if (metals or self._has_smooth) and have_radiosity else set()
         return ShownBodies(mirrors, tuple(sorted(nonmetals)))
 
     def radiance(

@@ -83,13 +83,17 @@ class SceneBlockers:
         bulging_bodies = tuple(body for body, reason in enumerate(why) if reason and self._can_bulge[body])
         return BlockerKinds(traced, rotations, why, plane_bodies, convex, solids, bulging_bodies)
 
-    def _is_costly(self, body: int) -> bool:
-        return sum(len(part.edges) for part in self.scene_parts.parts[body]) > _COSTLY_EDGES
+    @functools.cached_property
+    def _costly_bodies(self) -> set[int]:
+        """Bodies whose convex parts have many edges."""
+        edge_counts = {body: sum(len(part.edges) for part in parts) for body, parts in self.scene_parts.parts.items()}
+        return {body for body, count in edge_counts.items() if count > _COSTLY_EDGES}
 
     def _remark_on_costs(self, convex: tuple[int, ...]) -> None:
         """Say once of each mesh that its convex parts take longer than spheres."""
-        for body in (self._merged_scene.scene.bodies[number] for number in convex if self._is_costly(number)):
-            if body.mesh not in _remarked:
+        for number in convex:
+            body = self._merged_scene.scene.bodies[number]
+            if number in self._costly_bodies and body.mesh not in _remarked:
                 _remarked.add(body.mesh)
                 words = "blocks light by its convex parts: nearer to its shape than spheres, in twice the time or more"
                 remark(f"{body.name!r} {words}; blockers = 256 takes spheres", shows=self._progress)
@@ -171,7 +175,7 @@ class SceneBlockers:
             return "as a part of a plane: it is flat"
         convex_parts = self.scene_parts.parts[body] if body in kinds.convex else []
         parts = f"as {len(convex_parts)} convex part{'s' * (len(convex_parts) != 1)}"
-        is_costly = bool(convex_parts) and self._is_costly(body)
+        is_costly = body in kinds.convex and body in self._costly_bodies
         costs = "; spheres, blockers = 256, take half of the time or less, and are up to twice as far off" * is_costly
         if body in kinds.solids:
             return f"{parts}, its own, too: it consists of them{costs}"

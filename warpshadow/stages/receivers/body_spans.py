@@ -6,7 +6,7 @@ light, or to its table.
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +32,12 @@ def spans_of(bodies: np.ndarray) -> tuple[Span, ...]:
     changes = np.flatnonzero(np.diff(bodies)) + 1
     bounds = [0, *changes.tolist(), len(bodies)] if len(bodies) else []
     return tuple(Span(int(bodies[first]), first, end) for first, end in itertools.pairwise(bounds))
+
+
+def spans_between(bodies: Iterable[int], ends: np.ndarray) -> tuple[Span, ...]:
+    """Spans of bodies whose receivers follow each other, without empty ones; ends [body + 1] begin with the first."""
+    pairs = zip(bodies, itertools.pairwise(ends.tolist()), strict=True)
+    return tuple(Span(body, first, end) for body, (first, end) in pairs if end > first)
 
 
 def relative_spans(spans: Sequence[Span]) -> tuple[Span, ...]:

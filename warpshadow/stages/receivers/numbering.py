@@ -8,7 +8,7 @@ import warp as wp
 
 from warpshadow.device.capacities import sizes_of, write_numbers
 from warpshadow.device.launch import launch
-from warpshadow.device.memory import empty, filled, from_numpy, zeros
+from warpshadow.device.memory import empty, filled, zeros
 from warpshadow.device.parallel import split_row
 
 _RUN = 64  # items that a thread owns
@@ -129,14 +129,9 @@ def number_items(name: str, keys: wp.array, key_count: int, order: wp.array | No
     launch(_find_totals, key_count, inputs=[ends, row_count, thread_count], outputs=[totals])
     sizes = sizes_of(name, totals, item_count)
     ends_of_keys = np.array(list(itertools.accumulate(sizes.tolist(), initial=0)), np.int32)
-    put = write_numbers if device.is_capturing else _copied
-    ends_on_device = put(ends_of_keys, device)
+    ends_on_device = write_numbers(ends_of_keys, device)
     numbers = empty(keys.shape, dtype=wp.int32, device=device)
     items = filled((row_count, int(ends_of_keys[-1])), -1, dtype=wp.int32, device=device)
     inputs = [keys, order, _RUN, ends, ends_on_device]
     launch(_number_items, dim, cost=cost, inputs=inputs, outputs=[counts, numbers, items])
     return Numbers(numbers, items, ends_of_keys, ends_on_device)
-
-
-def _copied(numbers: np.ndarray, device: wp.Device) -> wp.array:
-    return from_numpy(numbers, dtype=wp.int32, device=device)

@@ -9,7 +9,6 @@
 - In squares of a quadtree there is one at each corner, and samples interpolate in triangles of these.
 """
 
-import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +20,7 @@ from warpshadow.device.launch import launch
 from warpshadow.device.memory import empty, reshaped
 from warpshadow.device.parallel import run_length, split_row
 from warpshadow.stages.raster.rasterization import Fragments
-from warpshadow.stages.receivers.body_spans import Span
+from warpshadow.stages.receivers.body_spans import Span, spans_between
 from warpshadow.stages.receivers.numbering import number_items
 from warpshadow.stages.receivers.quadtree import Quadtree, sample_at
 from warpshadow.stages.receivers.receiver_means import VisibleSurface, mean_fragments, sample_of_pixel
@@ -274,11 +273,7 @@ def find_sample_receivers(
         sample_fragments,
         samples,
         numbers,
-        tuple(
-            Span(body_id, first, end)
-            for body_id, (first, end) in zip(body_ids.tolist(), itertools.pairwise(ends.tolist()), strict=True)
-            if end > first
-        ),
+        spans_between(body_ids.tolist(), ends),
     )
 
 

@@ -1,6 +1,5 @@
 """Receivers at vertices: which vertices an image sees, and their numbers as receivers."""
 
-import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +11,7 @@ from warpshadow.device.memory import empty, from_numpy, reshaped, zeros
 from warpshadow.device.parallel import run_length
 from warpshadow.stages.raster.rasterization import Fragments
 from warpshadow.stages.raster.sides import split_side
-from warpshadow.stages.receivers.body_spans import Span, spans_of
+from warpshadow.stages.receivers.body_spans import Span, spans_between, spans_of
 from warpshadow.stages.receivers.numbering import number_items
 from warpshadow.stages.silhouettes.silhouettes import Silhouettes
 
@@ -252,6 +251,5 @@ def number_seen_vertices(is_seen: wp.array, keys: VertexKeys, *, are_distinct: b
         if not vertices.size:
             raise RuntimeError("a graph is captured of an image without receivers at vertices")
         launch(_fill_room, vertices.size, inputs=[ends_on_device, keys.first_vertices], outputs=[vertices])
-    pairs = zip(keys.bodies, itertools.pairwise(ends.tolist()), strict=True)
-    spans = tuple(Span(body, first, end) for body, (first, end) in pairs if end > first)
-    return Numbering(vertices, no_static_vertices, receiver_of_vertex, spans if are_distinct else ())
+    spans = spans_between(keys.bodies, ends) if are_distinct else ()
+    return Numbering(vertices, no_static_vertices, receiver_of_vertex, spans)
